@@ -74,9 +74,9 @@ def write_poses_bounds(path: Path, kind: Kind, cameras: np.ndarray, frame: Frame
     """Write LLFF's poses_bounds.npy, [V, 17], at full resolution.
 
     Each row has a 3 x 5 matrix, row by row, and the near and far depth. The columns of the matrix are the directions
-    down, right and backwards, the camera centre, and (height, width, focal length). Near and far are the 0.1 and 99.9
+    down, right and backwards, the camera center, and (height, width, focal length). Near and far are the 0.1 and 99.9
     percentiles of the depths of all sparse points in front of the camera, also of those that the camera does not show.
-    Centres and depths are in the scene frame.
+    Centers and depths are in the scene frame.
     """
     rows = []
     positions = frame.points(points.positions)

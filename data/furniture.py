@@ -2,7 +2,7 @@
 
 The functions below the class add one piece each to a `Furniture`, here called `f`, with random details from the
 generator `draw`. Room frame: metres, x right, y up, z towards the cameras; the back wall is z = 0. Angles are in
-degrees. `x` and `z` are the centre of a piece, unless its docstring says otherwise. A solid is *removable* if it
+degrees. `x` and `z` are the center of a piece, unless its docstring says otherwise. A solid is *removable* if it
 belongs to an object that the scene asks to remove or to insert.
 """
 
@@ -21,7 +21,7 @@ class Material:
     Attributes:
         texture: name of the texture.
         tile: side of the repeated texture in metres; 0 stretches one texture over the whole face.
-        tint: factor on the texture's linear colour.
+        tint: factor on the texture's linear color.
         turned: True exchanges the axes of the texture, so that its rows run along v of the face.
     """
 
@@ -68,9 +68,9 @@ class Furniture:
         """Add an upright box.
 
         Args:
-            x: centre, metres.
+            x: center, metres.
             bottom: height of its lower face, metres.
-            z: centre, metres.
+            z: center, metres.
             size: (wide, high, deep) in metres.
             sides: material of all faces except those with a material of their own.
             front: material of the face that points to +z before the yaw; None for `sides`.
@@ -81,16 +81,16 @@ class Furniture:
         self._add(BOX, (x, bottom + half[1], z), half, yaw, faces, removable)
 
     def sphere(self, x, bottom, z, radius, material, yaw=0.0, removable=False):
-        """Add a sphere whose lowest point is at the height `bottom`; x and z are its centre (all in metres)."""
+        """Add a sphere whose lowest point is at the height `bottom`; x and z are its center (all in metres)."""
         self._add(SPHERE, (x, bottom + radius, z), (radius,) * 3, yaw, [material], removable)
 
     def cylinder(self, x, bottom, z, radius, high, side, top=None, removable=False):
         """Add an upright cylinder.
 
         Args:
-            x: centre, metres.
+            x: center, metres.
             bottom: height of its lower face, metres.
-            z: centre, metres.
+            z: center, metres.
             radius: metres.
             high: metres.
             side: material of the side and of the lower face.
@@ -208,7 +208,7 @@ def shelf(f: Furniture, draw, x: float, z: float, wide: float, yaw: float = 0.0)
 def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, deep: float) -> None:
     """Add the removable object of "demo" and most other kinds: a cabinet with a ball and a jar on it.
 
-    x is the cabinet's centre, and z its back.
+    x is the cabinet's center, and z its back.
     """
     body = Material("paint", 1.3)
     f.box(x, 0, z + deep / 2, (wide, high, deep), body, Material("front"), removable=True)
@@ -316,7 +316,7 @@ def daybed(f: Furniture, draw, x: float, z: float) -> None:
     f.cylinder(x - 0.25, high + 0.025, z + 0.1, 0.08, 0.13, Material("jar"), removable=True)
 
 
-def chest_with_neighbours(f: Furniture, draw, x: float, z: float) -> None:
+def chest_with_neighbors(f: Furniture, draw, x: float, z: float) -> None:
     """Add the removable object of the kind "beside", a chest with a ball and a jar, and four things that stay.
 
     The things stand around the chest, within half its radius, one on each side. So from every side the chest hides a

@@ -53,7 +53,7 @@ from tasks import (
 )
 from world import World, bake
 
-AWAY = 2.5  # distance from the middle camera to the sphere's centre, metres; about the point that the cameras look at
+AWAY = 2.5  # distance from the middle camera to the sphere's center, metres; about the point that the cameras look at
 # Largest share of the masks that may be never seen if the object hangs. Only crannies behind furniture are never seen.
 MOST_NEVER_SEEN = 0.005
 PROFILE = "profile: laptop # small pictures, made for it; `make profile=paper` has precedence\n"

@@ -75,7 +75,7 @@ def direct_light(solids, points, normals, owner, lamps, side):
         points: [M, 3] nodes.
         normals: [M, 3].
         owner: [M] index of the solid of each node.
-        lamps: [L, 15]: centre, half edge a, half edge b, direction of emission, radiance, three numbers each.
+        lamps: [L, 15]: center, half edge a, half edge b, direction of emission, radiance, three numbers each.
         side: side x side shadow rays per lamp.
     """
     light = np.zeros((points.shape[0], 3))
@@ -115,7 +115,7 @@ def bounced_light(solids, faces, textures, points, normals, owner, light, ambien
     """Compute the light [M, 3], as irradiance / pi, that reaches the nodes from other surfaces after one bounce.
 
     This is the mean radiance of the surfaces in a cosine-weighted hemisphere about the normal, without the light that
-    reaches the nodes directly from lamps. All nodes use the same low-discrepancy directions, so that neighbouring nodes
+    reaches the nodes directly from lamps. All nodes use the same low-discrepancy directions, so that neighboring nodes
     do not differ by noise. As in `direct_light`, the object has an effect on its own nodes only.
 
     Args:

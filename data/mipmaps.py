@@ -1,4 +1,4 @@
-"""Textures with all their mip levels, and the colour of a face at a point."""
+"""Textures with all their mip levels, and the color of a face at a point."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Textures(NamedTuple):
         texels: [total, 3] uint8 sRGB, all levels of all textures.
         start: [K, levels] index in `texels` of the first texel of each level.
         side: [K] pixels along a side at level 0.
-        mean: [K, 3] mean colour, linear.
+        mean: [K, 3] mean color, linear.
         linear: [256] linear intensity of each sRGB byte.
     """
 
@@ -78,9 +78,9 @@ def _texel(textures, k, level, a, b, out, weight):
 
 @kernel()
 def albedo(faces, textures, face, u, v, footprint, out):
-    """Write the linear colour of a face at the point (u, v) to `out` [3], averaged over about `footprint` metres.
+    """Write the linear color of a face at the point (u, v) to `out` [3], averaged over about `footprint` metres.
 
-    The colour is that of the texture times the face's tint, without light. u and v are metres on the face. The two mip
+    The color is that of the texture times the face's tint, without light. u and v are metres on the face. The two mip
     levels around the footprint are interpolated.
     """
     if faces.swap[face]:

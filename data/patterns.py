@@ -1,4 +1,4 @@
-"""Components of textures: tileable noise, coordinates, colour ramps.
+"""Components of textures: tileable noise, coordinates, color ramps.
 
 Pictures are [N, N] or [N, N, 3] arrays of floats, float32 or float64. A *tile* is the whole picture; coordinates in
 tiles run from 0 to 1. A *cell* is one of the equal parts into which a pattern divides the tile, e.g. the place of a
@@ -42,7 +42,7 @@ def fbm(rng, size, rows, columns, octaves=5, gain=0.55):
 
 
 def grid(size):
-    """Return the coordinates (x, y) of the pixel centres, [size, size] each, in (0, 1)."""
+    """Return the coordinates (x, y) of the pixel centers, [size, size] each, in (0, 1)."""
     line = (np.arange(size, dtype=np.float32) + 0.5) / size
     return np.meshgrid(line, line)
 
@@ -54,18 +54,18 @@ def step(edge0, edge1, x):
 
 
 def ramp(t, *colors):
-    """Return colours [N, N, 3] in [0, 1], interpolated along a palette at t [N, N].
+    """Return colors [N, N, 3] in [0, 1], interpolated along a palette at t [N, N].
 
     Args:
-        t: place in the palette: 0 is its first colour, 1 its last; values outside [0, 1] get these colours.
-        colors: the palette, evenly spaced colours in bytes.
+        t: place in the palette: 0 is its first color, 1 its last; values outside [0, 1] get these colors.
+        colors: the palette, evenly spaced colors in bytes.
     """
     palette = np.asarray(colors, np.float32) / 255
     return np.stack([np.interp(t, np.linspace(0, 1, len(palette)), palette[:, c]) for c in range(3)], -1)
 
 
 def blend(a, b, t):
-    """Return the mixture of two colours or pictures [N, N, 3]: a where t [N, N] is 0, b where t is 1."""
+    """Return the mixture of two colors or pictures [N, N, 3]: a where t [N, N] is 0, b where t is 1."""
     return a + (b - a) * t[..., None]
 
 
@@ -87,7 +87,7 @@ def shift(image, x, y):
 
 
 def srgb(color):
-    """Return a colour [3] in [0, 1] as float32 from a colour in bytes."""
+    """Return a color [3] in [0, 1] as float32 from a color in bytes."""
     return np.asarray(color, np.float32) / 255
 
 

@@ -226,7 +226,7 @@ def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
 
 
 def pixel_centers(mask: np.ndarray) -> np.ndarray:
-    """Return the image points (x, y) of the centres of a mask's P True pixels, [P, 2]."""
+    """Return the image points (x, y) of the centers of a mask's P True pixels, [P, 2]."""
     return np.argwhere(mask)[:, ::-1] + 0.5
 
 

@@ -1,7 +1,7 @@
 """The ray caster: renders pictures of the room, finds surface points, and tests which points a camera sees.
 
 A camera is one row of 16 numbers: f, cx, cy in px; k1; the camera-to-room rotation (9 numbers, row by row; the camera
-looks along +z, x right, y down); the centre (3 numbers). The lens is COLMAP's SIMPLE_RADIAL: a ray (x, y, 1) in the
+looks along +z, x right, y down); the center (3 numbers). The lens is COLMAP's SIMPLE_RADIAL: a ray (x, y, 1) in the
 camera's frame is projected to f (1 + k1 r^2) (x, y) + (cx, cy), r^2 = x^2 + y^2.
 """
 
@@ -165,7 +165,7 @@ def surface_points(solids, camera, pixels, with_object):
 
 @kernel()
 def _reaches(solids, camera, with_object, px, py, pz):
-    """Return True if no solid is between the camera's centre and a room point."""
+    """Return True if no solid is between the camera's center and a room point."""
     ax, ay, az = px - camera[13], py - camera[14], pz - camera[15]
     far = math.sqrt(ax * ax + ay * ay + az * az)
     return not is_blocked(

@@ -87,7 +87,7 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
 
 
 def _textured_pixels(photo: np.ndarray, count: int, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw `count` pixels, more often where the gradient of the grey levels is large; return (rows, columns)."""
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    edges = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).ravel() + 4
+    """Draw `count` pixels, more often where the gradient of the gray levels is large; return (rows, columns)."""
+    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    edges = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)).ravel() + 4
     return np.divmod(draw.choice(edges.size, count, replace=False, p=edges / edges.sum()), photo.shape[1])

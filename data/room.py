@@ -13,7 +13,7 @@ from furniture import (
     Material,
     cabinet,
     chest,
-    chest_with_neighbours,
+    chest_with_neighbors,
     daybed,
     keepsake,
     lantern,
@@ -30,7 +30,7 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.is_circle:
-        return f, _round_room(f, draw, planks, chest_with_neighbours if kind.place == "beside" else daybed)
+        return f, _round_room(f, draw, planks, chest_with_neighbors if kind.place == "beside" else daybed)
     others = {"table": table_room, "corner": wall_corner, "grass": garden}
     if kind.place in others:
         return f, others[kind.place](f, draw, planks)

@@ -56,7 +56,7 @@ class Faces(NamedTuple):
         texture: [f] index of the texture.
         mapping: [f, 4] tiles of the texture per metre along u and along v, then the offsets of both in tiles.
         swap: [f] bool, True if u and v are exchanged before the mapping.
-        tint: [f, 3] factor on the linear colour of the texture.
+        tint: [f, 3] factor on the linear color of the texture.
         size: [f, 2] extent along u and v, metres.
         grid: [f, 3] the face's light map: index of its first node among the nodes of all faces, number of columns, and
             number of rows.

@@ -25,7 +25,7 @@ def without_object(solids: Solids) -> Solids:
 
 
 def bounding_region(solids: Solids) -> tuple[np.ndarray, float]:
-    """Return a sphere around the removable solids, with a margin, as (centre [3], radius), metres in the room frame."""
+    """Return a sphere around the removable solids, with a margin, as (center [3], radius), metres in the room frame."""
     center, reach = solids.center[solids.removable], solids.reach[solids.removable]
     half = solids.half[solids.removable]
     middle = ((center - half).min(0) + (center + half).max(0)) / 2
@@ -90,7 +90,7 @@ def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center:
 
     Args:
         cameras: [V, 16].
-        center: [3], centre of the sphere with the radius `SPHERE`.
+        center: [3], center of the sphere with the radius `SPHERE`.
         first: index of the camera to begin with.
 
     Returns:

@@ -1,7 +1,7 @@
 """Procedural textures: square, tileable (or fitted to one face), [N, N, 3] floats, sRGB from 0 to about 1.
 
 Each function makes one kind of texture. Its arguments are a numpy random generator `rng` and N, called `size`, which is
-a power of two. `mipmaps.build_mipmaps` clips values above 1. Arguments that are colours are in bytes. A texture *fitted
+a power of two. `mipmaps.build_mipmaps` clips values above 1. Arguments that are colors are in bytes. A texture *fitted
 to its face* is stretched over one whole face instead of repeated.
 """
 
@@ -25,7 +25,7 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
     Args:
         rows: number of rows of boards.
         pieces: number of boards per row.
-        palette: colours from dark to light; None draws one of `WOODS`.
+        palette: colors from dark to light; None draws one of `WOODS`.
     """
     palette = WOODS[rng.integers(len(WOODS))] if palette is None else palette
     x, y = grid(size)
@@ -268,7 +268,7 @@ def plain_paint_front(rng, size, color=(30, 120, 120)):
 
 
 def plain_paint(rng, size, color=(30, 120, 120)):
-    """Make brushed paint of one colour."""
+    """Make brushed paint of one color."""
     relief = 1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3)
     return srgb(color) * relief[..., None]
 
@@ -276,7 +276,7 @@ def plain_paint(rng, size, color=(30, 120, 120)):
 def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
     """Make a beach ball, fitted to a sphere: x is the longitude and y the latitude.
 
-    Its wedges about a tilted axis alternate between the colours `first` and `second`; its caps are yellow.
+    Its wedges about a tilted axis alternate between the colors `first` and `second`; its caps are yellow.
     """
     x, y = grid(size)
     longitude, latitude = x * 6.2832, y * 3.1416
@@ -311,7 +311,7 @@ def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
 
 
 def glaze(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
-    """Make glazed pottery with wavy rings of the colour `bands`, fitted to its face."""
+    """Make glazed pottery with wavy rings of the color `bands`, fitted to its face."""
     x, y = grid(size)
     wash = srgb(color) * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]
     ring = np.zeros_like(x)

@@ -2,7 +2,7 @@
 
 No leaf is stored: the number of a cell determines the shape of its leaf. So a lawn of a hundred thousand blades costs
 as much as its box and a few steps per ray. A leaf is always inside its cell, so the first leaf that a ray hits is the
-nearest one. Coordinates are those of the box: the origin is its centre, the axes are parallel to its edges.
+nearest one. Coordinates are those of the box: the origin is its center, the axes are parallel to its edges.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _mix_bits(state):
 
 @kernel()
 def _leaf(solids, n, i, j, k, leaf):
-    """Write the leaf in cell (i, j, k) of solid n to `leaf` [4, 3], centre and axes; return False if there is none."""
+    """Write the leaf in cell (i, j, k) of solid n to `leaf` [4, 3], center and axes; return False if there is none."""
     columns, layers = int(solids.leaves[n, 0]), int(solids.leaves[n, 1])
     state = _mix_bits(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
     if state < BARE * 4294967296.0:

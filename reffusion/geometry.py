@@ -34,7 +34,7 @@ def to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
 def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Project world points [..., 3] to pixel coordinates uv [..., 2] and camera depth z [...], both float64.
 
-    The pixel in row j and column i has its centre at uv = (i + 0.5, j + 0.5). Points with z <= 0 are not in front of
+    The pixel in row j and column i has its center at uv = (i + 0.5, j + 0.5). Points with z <= 0 are not in front of
     the camera. Their uv is NaN, not a mirrored position.
     """
     x, y, z = np.moveaxis(to_camera(points, camera), -1, 0)
@@ -56,7 +56,7 @@ def is_in_frame(uv: np.ndarray, z: np.ndarray, camera: Camera, margin: float = 0
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
-    """Return the ray directions through the pixel centres in the camera's axes, scaled to z = 1: float64 [H, W, 3]."""
+    """Return the ray directions through the pixel centers in the camera's axes, scaled to z = 1: float64 [H, W, 3]."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1)
@@ -66,7 +66,7 @@ def unproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the world points, float64 [H, W, 3], that a depth map describes; the inverse of `project`.
 
     Args:
-        depth: [H, W], camera z at the pixel centres.
+        depth: [H, W], camera z at the pixel centers.
 
     Raises:
         ValueError: the size of the depth map is not the size of the camera's image.
@@ -116,7 +116,7 @@ def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Came
         others: at least one camera.
 
     Returns:
-        Degrees in [0, 180]. An angle counts as 180 if the centre of one of its two cameras is the point, because this
+        Degrees in [0, 180]. An angle counts as 180 if the center of one of its two cameras is the point, because this
         camera has no direction.
     """
     towards = np.stack([view.center - point for view in (camera, *others)])
@@ -129,7 +129,7 @@ def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Came
 def cameras_extent(cameras: Sequence[Camera]) -> float:
     """Return the extent of a scene as 3DGS defines it.
 
-    This is 1.1 times the largest distance of a camera's centre from the mean of all camera centres, in world units.
+    This is 1.1 times the largest distance of a camera's center from the mean of all camera centers, in world units.
     """
     centers = np.stack([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())

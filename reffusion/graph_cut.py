@@ -1,4 +1,4 @@
-"""Minimum cuts through graphs of neighbouring pixels or Gaussians."""
+"""Minimum cuts through graphs of neighboring pixels or Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, st
     Args:
         true_cost, false_cost: [N], cost of labelling a node True or False. Only the difference of both matters, and a
             difference above `HARD` counts as `HARD`.
-        pairs: [E, 2] int, indices of neighbouring nodes, each pair once.
+        pairs: [E, 2] int, indices of neighboring nodes, each pair once.
         strength: [E] >= 0, cost of a pair whose nodes have different labels.
     """
     count = len(true_cost)
@@ -48,7 +48,7 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
 
     Args:
         cost: [K, N] >= 0, cost of each label at each node.
-        pairs: [E, 2] int, indices of neighbouring nodes, each pair once.
+        pairs: [E, 2] int, indices of neighboring nodes, each pair once.
         strength: [E] >= 0, cost of a pair whose nodes have different labels.
         start: int [N], initial labels. They are not modified.
     """

@@ -159,7 +159,7 @@ class Trace:
 
 
 def decibels(squared_error: float) -> float:
-    """Return -10 log10 of a mean squared error, at most 100. For colours in [0, 1] this is the PSNR in dB."""
+    """Return -10 log10 of a mean squared error, at most 100. For colors in [0, 1] this is the PSNR in dB."""
     return -10 * log10(max(squared_error, 1e-10))
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera of one view. Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i+0.5, j+0.5).
+    """A pinhole camera of one view. Pixel (column i, row j) covers [i, i+1) x [j, j+1); its center is (i+0.5, j+0.5).
 
     Attributes:
         name: the view's name, unique in the scene, without a file ending.
@@ -42,7 +42,7 @@ class Camera:
 
     @cached_property
     def center(self) -> np.ndarray:
-        """[3] float64, the optical centre in world coordinates."""
+        """[3] float64, the optical center in world coordinates."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
@@ -134,7 +134,7 @@ class Gaussians:
         quaternions: [N, 4], wxyz, of any length (a zero quaternion is the identity).
         log_scales: [N, 3], natural logarithm of the standard deviations.
         opacity_logits: [N].
-        sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k, clamped
+        sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; color = 0.5 + sum_k Y_k sh_k, clamped
             from below at 0.
         antialiased: True if the Gaussians are rendered with the 2D filter of Mip-Splatting. The low-pass widens the
             footprint of a Gaussian; this filter lowers its opacity in proportion, so that the footprint's total
@@ -176,7 +176,7 @@ class Rendering(NamedTuple):
     """The result of `splat.rasterizer.render`. All tensors but `radii` are differentiable in the Gaussians.
 
     Attributes:
-        color: [H, W, 3], the blended colours over the background colour.
+        color: [H, W, 3], the blended colors over the background color.
         depth: [H, W], the blended camera z, divided by alpha; 0 where alpha is 0.
         alpha: [H, W] in [0, 1).
         features: [H, W, C], the blended features, not divided by alpha; None if no features were rendered.

@@ -81,7 +81,7 @@ class Workspace:
 
     @cached_property
     def shadowless_gaussians(self) -> Gaussians:
-        """The N Gaussians of the whole scene, with the colours that they have without the object's soft shadow."""
+        """The N Gaussians of the whole scene, with the colors that they have without the object's soft shadow."""
         return self.shadow.remove_from_gaussians(self.gaussians) if self.shadow else self.gaussians
 
     @cached_property

@@ -16,13 +16,13 @@ POINT_WEIGHT = 1e-2  # weight of the points' median in the focus point; the opti
 def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
     """Return cameras on an ellipse that fits the positions of a capture's cameras, all looking at the same point.
 
-    The centre of the ellipse is the mean camera position. Its axes are the first two principal axes of the positions,
+    The center of the ellipse is the mean camera position. Its axes are the first two principal axes of the positions,
     and each semi-axis is sqrt(2) times the standard deviation along the axis. So cameras on a circle give this circle,
     and cameras side by side give a flat loop in front of the scene. The point looked at is `focus_point`.
 
     Args:
         cameras: cameras of the capture, at least one; the middle one of the sequence provides image size and focal
-            lengths. The principal point of the returned cameras is the image centre.
+            lengths. The principal point of the returned cameras is the image center.
         points: [P, 3] sparse points of the scene. Their median determines the distance of the focus point if the
             optical axes are parallel. May be empty.
         frames: number of cameras to return; the path is closed, and the last camera is one step before the first.

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
-BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
+# Okabe and Ito's palette, which color-blind readers can tell apart.
+BLUE, ORANGE, GREEN, GRAY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
 WIDTH, DPI = 9.6, 200  # inches (page width) and dots per inch
-LABEL_GAP = 12  # least horizontal distance of a label to its neighbours, px
+LABEL_GAP = 12  # least horizontal distance of a label to its neighbors, px
 LABEL_OFFSETS = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
           (14, 14), (-14, 14), (14, -14), (-14, -14), (0, 22), (0, -22), (26, 24), (-26, 24), (26, -24), (-26, -24),
           (0, 34), (0, -34), (40, 34), (-40, 34), (40, -34), (-40, -34)]  # fmt: skip
@@ -53,7 +53,7 @@ def save_chart(chart: Figure, path: Path) -> None:
     save_image(path, np.asarray(chart.canvas.buffer_rgba())[..., :3].copy())
 
 
-def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
+def annotate(axes: Axes, text: str, at, offset=(0, 0), color: str = INK, ha: str = "left", va: str = "center") -> None:
     """Write text beside a data point of a chart.
 
     Args:
@@ -62,7 +62,7 @@ def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: st
         ha: horizontal alignment of the text.
         va: vertical alignment of the text.
     """
-    look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
+    look = {"fontsize": 9, "color": color, "ha": ha, "va": va}
     axes.annotate(text, at, offset, textcoords="offset points", **look)
 
 
@@ -109,7 +109,7 @@ def draw_tradeoff(
         order = np.argsort(np.asarray(seconds)[front], kind="stable")
         steps = np.column_stack([seconds, values])[front][order]
         axes.step(steps[:, 0], steps[:, 1], where="post", color=BLUE, linewidth=1.2, alpha=0.6)
-        axes.plot(*np.column_stack([seconds, values])[~front].T, "o", color=GREY, markersize=6, markerfacecolor="white")
+        axes.plot(*np.column_stack([seconds, values])[~front].T, "o", color=GRAY, markersize=6, markerfacecolor="white")
         axes.plot(*steps.T, "o", color=BLUE, markersize=7)
         axes.set_ylabel(title, fontsize=10)
         if needs_log_axis(seconds):
@@ -149,9 +149,9 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
         obstacles += [np.array([x, y - unit, to_x, y + unit]), np.array([to_x - unit, to_y, to_x + unit, y])]
     inside = axes.get_window_extent(renderer)
     for index in np.argsort(-pixels[:, 0], kind="stable"):
-        colour = BLUE if strong[index] else INK
+        color = BLUE if strong[index] else INK
         text = axes.annotate(
-            names[index], points[index], (0, 0), textcoords="offset points", fontsize=9, color=colour, va="bottom",
+            names[index], points[index], (0, 0), textcoords="offset points", fontsize=9, color=color, va="bottom",
             weight="bold" if names[index] == "full" else "normal",
         )  # fmt: skip
         wide, high = text.get_window_extent(renderer).size
@@ -171,7 +171,7 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
 def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float, unit: float) -> np.ndarray:
     """Return the box [left, bottom, right, top], px, of a text at `place` (in points, `unit` px each) from `point`."""
     x, y = point + np.array(place) * unit
-    # A positive offset puts the text on the right of the point, a negative one on the left, and 0 centres it.
+    # A positive offset puts the text on the right of the point, a negative one on the left, and 0 centers it.
     left = x - wide / 2 if place[0] == 0 else x if place[0] > 0 else x - wide
     return np.array([left, y - high / 2, left + wide, y + high / 2])
 
@@ -197,7 +197,7 @@ def draw_forest(
     """Draw one panel per metric with each method's difference to the full method and its confidence intervals.
 
     The left side of a panel is always worse than the full method. A difference is blue (better) or orange (worse) if
-    its interval over views excludes zero, else grey. A thick line is the interval over views, a thin line the interval
+    its interval over views excludes zero, else gray. A thick line is the interval over views, a thin line the interval
     over scenes. A difference whose absolute value is more than three times the panel's median absolute difference is
     drawn as an arrow with the number.
 
@@ -230,19 +230,19 @@ def draw_forest(
 def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:
     """Draw a method's difference and its intervals into a row; `sign` is 1 if more of the metric is better, else -1."""
     mean, views = difference.mean, difference.views or 0
-    colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
+    color = GRAY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
     if abs(mean) > far:  # does not fit the panel: drawn as an arrow with the number
         worse = sign * mean < 0
         words = f"◂ {mean:+.2g}" if worse else f"{mean:+.2g} ▸"
         at = {"ha": "left" if worse else "right", "va": "center", "transform": axes.get_yaxis_transform()}
-        axes.text(0.01 if worse else 0.99, row, words.replace("-", "−"), fontsize=9, color=colour, **at)
+        axes.text(0.01 if worse else 0.99, row, words.replace("-", "−"), fontsize=9, color=color, **at)
         return
     if difference.scenes:
-        centre = difference.scenes_mean
-        ends = np.clip([centre - difference.scenes, centre + difference.scenes], -far, far)
-        axes.plot(ends, [row, row], color=colour, linewidth=1.2, solid_capstyle="butt")
-    axes.plot([mean - views, mean + views], [row, row], color=colour, linewidth=4, solid_capstyle="butt")
-    axes.plot(mean, row, "o", markersize=6, color=colour)
+        center = difference.scenes_mean
+        ends = np.clip([center - difference.scenes, center + difference.scenes], -far, far)
+        axes.plot(ends, [row, row], color=color, linewidth=1.2, solid_capstyle="butt")
+    axes.plot([mean - views, mean + views], [row, row], color=color, linewidth=4, solid_capstyle="butt")
+    axes.plot(mean, row, "o", markersize=6, color=color)
 
 
 def _far(differences: Sequence[Difference]) -> float:

@@ -18,7 +18,7 @@ from report import cli, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # largest width and height of a picture, and the gap between pictures, px
 COLUMNS = 6
-TINT = (255, 0, 160)  # colour of the training views' masks; masks for scoring test views get the complementary colour
+TINT = (255, 0, 160)  # color of the training views' masks; masks for scoring test views get the complementary color
 
 
 def make(home: Path) -> tuple[Path, list[str]]:

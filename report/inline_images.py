@@ -14,7 +14,7 @@ from reffusion.io.images import resize_image
 
 QUALITY = 70  # WebP quality
 BYTES_PER_PIXEL = 0.2  # approximate size of a photograph at that quality
-COLOURS = 64  # palette size of a chart
+COLORS = 64  # palette size of a chart
 
 
 def photo_address(array: np.ndarray, longest: int) -> str:
@@ -33,7 +33,7 @@ def chart_element(path: Path, alt: str) -> str:
     The chart scrolls sideways on a narrow screen instead of shrinking, so that its text stays readable.
     """
     with Image.open(path) as image:
-        reduced = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        reduced = image.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE)
     source = _address(reduced, "png", optimize=True)
     return f'<div class="wide"><img class="chart" src="{source}" alt="{escape(alt)}"></div>'
 

@@ -28,12 +28,12 @@ DEPTH_VIEWS = 4  # number of views
 ORIGIN_VIEWS = 6  # number of views
 WORDS_OF_ORIGINS = {
     "photographs": "green, other photographs show it:",
-    "conflict": "white, photographs show it in another colour:",
+    "conflict": "white, photographs show it in another color:",
     "reference": "blue, a reference:",
     "patches": "orange, invented from patches of the photographs:",
     "nothing": "red, no picture shows it:",
 }
-REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours of consistent masks and of invent masks
+REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colors of consistent masks and of invent masks
 MIN_ALPHA = 0.5  # below this alpha there is no depth
 RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
 
@@ -95,24 +95,24 @@ def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:
         name: name of the view.
     """
     small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
-    for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
+    for kind, color in (("consistent", REMOVED), ("invent", INVENTED)):
         path = job.folders.get("masks", Path()) / kind / f"{name}.png"
         if "masks" in job.folders and path.is_file():
-            draw_outline(small, load_mask(path), colour)
+            draw_outline(small, load_mask(path), color)
     return small
 
 
-def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
+def draw_outline(picture: np.ndarray, mask: np.ndarray, color: tuple[int, int, int]) -> None:
     """Draw the outline of a mask into a picture, uint8 [H, W, 3], in place.
 
     Args:
         mask: bool [h, w], True inside, of the picture's aspect but of any size.
-        colour: RGB.
+        color: RGB.
     """
     scale = picture.shape[1] / mask.shape[1]
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     moved = [((contour + 0.5) * scale - 0.5).round().astype(np.int32) for contour in contours]
-    cv2.polylines(picture, moved, True, colour, 1 if picture.shape[1] < 400 else 2)
+    cv2.polylines(picture, moved, True, color, 1 if picture.shape[1] < 400 else 2)
 
 
 def references_section(job: JobFiles) -> list[str]:
@@ -203,9 +203,9 @@ def origins_section(job: JobFiles) -> list[str]:
 
 
 def depth_section(job: JobFiles) -> list[str]:
-    """Return HTML parts on depth: a few views of the fit and of the latest Gaussians, coloured by disparity.
+    """Return HTML parts on depth: a few views of the fit and of the latest Gaussians, colored by disparity.
 
-    The two pictures of a view have the same scale of colours; different views have different scales.
+    The two pictures of a view have the same scale of colors; different views have different scales.
     """
     stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     if not stages or "fit" not in stages or "poses" not in job.folders:
@@ -219,7 +219,7 @@ def depth_section(job: JobFiles) -> list[str]:
         pictures = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
         for words, picture in zip(loaded, pictures, strict=True):
             cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
-    legend = "Bright is near; pairs share a scale; grey is empty."
+    legend = "Bright is near; pairs share a scale; gray is empty."
     return [page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]
 
 
@@ -230,9 +230,9 @@ def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
-    """Return a picture of each depth map, uint8 [H, W, 3], with disparity (1 / depth) in colours.
+    """Return a picture of each depth map, uint8 [H, W, 3], with disparity (1 / depth) in colors.
 
-    Bright means near, grey means unknown. The scale of colours, which is the same for all maps, extends from the 1st to
+    Bright means near, gray means unknown. The scale of colors, which is the same for all maps, extends from the 1st to
     the 99th percentile of the first map's disparities.
 
     Args:

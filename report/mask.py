@@ -57,7 +57,7 @@ def serve(app: App, scene: str, port: int) -> None:
     announce(server, server.link(fragment=f"{quote(scene)}/object"))
     step = app.scenes[scene].mask_step
     if step is not None and step.session.segmenter is None:
-        print("clicks are segmented by colours and surfaces; with the network of `make weights` (37 MB) fewer suffice")
+        print("clicks are segmented by colors and surfaces; with the network of `make weights` (37 MB) fewer suffice")
     server.serve()
 
 

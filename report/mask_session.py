@@ -133,7 +133,7 @@ class Session:
     Args:
         capture: folders and given masks of the scene.
         is_fitted: returns True once the stage `fit` has finished.
-        segmenter: network that segments around clicks; None segments by colours and surfaces.
+        segmenter: network that segments around clicks; None segments by colors and surfaces.
     """
 
     def __init__(self, capture: Capture, is_fitted: Callable[[], bool], segmenter: Segmenter | None = None):

@@ -78,7 +78,7 @@ def table(
         rows: plain text, [rows][columns].
         bold: [rows][columns], True for cells in bold type; empty for none.
         text: indices of the columns with words, which are aligned to the left.
-        marked: index of the row with a coloured background; None for no row.
+        marked: index of the row with a colored background; None for no row.
     """
     alignment = lambda column: ' class="text"' if column in text else ""
     lines = ["<tr>" + "".join(f"<th{alignment(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]

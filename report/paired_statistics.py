@@ -22,7 +22,7 @@ class Difference:
         scenes: half the width of the 95% confidence interval of the mean of the scenes' means, from a paired t-test
             over one mean per scene. This interval is valid for other scenes of the same kind too. None for fewer than
             two scenes.
-        scenes_mean: mean of the scenes' means, the centre of the interval over scenes. It equals `mean` if all scenes
+        scenes_mean: mean of the scenes' means, the center of the interval over scenes. It equals `mean` if all scenes
             have equally many pairs.
     """
 

@@ -188,9 +188,9 @@ def save_charts(personal: dict[str, Any], path: Path) -> None:
     )
     for axes, key, title in zip(others, ("error", "variance"), ("clean-latent error", "variance of SDS"), strict=True):
         for scale, style in (("whole", "-"), ("window", "--")):
-            for when, colour in (("before", "tab:grey"), ("after", "tab:blue")):
+            for when, color in (("before", "tab:grey"), ("after", "tab:blue")):
                 values = personal[scale][when][key]
-                axes.plot(personal["timesteps"], values, style, color=colour, label=f"{scale}, {when}")
+                axes.plot(personal["timesteps"], values, style, color=color, label=f"{scale}, {when}")
         axes.set(title=f"{title}, unseen views", xlabel="timestep", ylim=(0, None))
     others[0].legend(fontsize="small")
     canvas.draw()

@@ -315,7 +315,7 @@ def own_seconds(run: Run, full: Run) -> float | None:
 
 
 def view_consistency(run: Run) -> float | None:
-    """Return the inconsistency between views: the mean absolute colour difference of the same points in two views.
+    """Return the inconsistency between views: the mean absolute color difference of the same points in two views.
 
     The value is in [0, 1]; less is better. The points are those in the masks, and each view is compared with the next
     view by name. None if metrics.json does not have the value.

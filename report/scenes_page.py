@@ -32,7 +32,7 @@ def make(jobs: list[JobFiles], out: Path) -> Path:
     if curves := main_error_curves(jobs):
         trace_charts.draw_scenes_chart(curves, out / "stages.png")
         parts += [page.heading("Error against seconds"), page.picture(out / "stages.png", "error against seconds")]
-        words = "Blue: median and quartiles over the scenes. Grey: each scene. A stage that has ended keeps its error."
+        words = "Blue: median and quartiles over the scenes. Gray: each scene. A stage that has ended keeps its error."
         parts.append(page.paragraph(words, quiet=True))
     parts += [page.heading("Median, and quartiles in brackets"), *statistics_tables(rows)]
     parts += [page.heading("Scenes"), scene_table(jobs)]

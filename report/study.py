@@ -166,7 +166,7 @@ def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> 
 
 
 def _corrupt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
-    """Return a picture reduced to coarse blocks, a third of which have random colours."""
+    """Return a picture reduced to coarse blocks, a third of which have random colors."""
     high, wide = picture.shape[:2]
     rows, columns = (max(2, round(side / BLOCK_SIZE)) for side in (high, wide))
     # The result is clearly worse, so that a participant who prefers it did not pay attention.

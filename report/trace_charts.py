@@ -16,8 +16,8 @@ import numpy as np
 from reffusion.io.traces import MAIN, QUANTITIES
 from report.charts import (
     BLUE,
+    GRAY,
     GREEN,
-    GREY,
     INK,
     ORANGE,
     annotate,
@@ -93,7 +93,7 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
         alone = len(curves) == 1
         for key, points in curves.items():
             words = f" {key}" if 1 < len(curves) <= 4 else ""
-            _curve(axes, name, points, BLUE if alone else GREY, words, main=alone and name == names[0])
+            _curve(axes, name, points, BLUE if alone else GRAY, words, main=alone and name == names[0])
         values = np.concatenate([points[:, 1] for points in curves.values()])
         if needs_log_axis(values, 10) and values.min() > 0:
             axes.set_yscale("log")
@@ -110,11 +110,11 @@ def quantity_curve(lines: Lines, name: str) -> np.ndarray:
     return np.array([(line["seconds"], line[name]) for line in lines if name in line], np.float64).reshape(-1, 2)
 
 
-def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
+def _curve(axes: Axes, name: str, points: np.ndarray, color: str, words: str, main: bool) -> None:
     """Draw a curve [moments, 2] (seconds, value) with its last value and `words`; `main` marks the best value too."""
-    axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
+    axes.plot(*points.T, color=color, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best_index(name, points[:, 1])]
-    annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
+    annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), color if main or not words else INK)
     if main and top[1] != last[1]:
         axes.plot(*top, "o", markersize=8, markerfacecolor="none", color=ORANGE)
         annotate(axes, f"best {top[1]:.3g}", top, (-7, 0), ORANGE, ha="right")
@@ -193,11 +193,11 @@ def draw_job_chart(
 def _errors(
     axes: Axes, curves: dict[str, tuple[str, np.ndarray]], ends: dict[str, tuple[float, float]], total: float
 ) -> None:
-    for (stage, (name, points)), colour in zip(curves.items(), (BLUE, GREEN, ORANGE), strict=False):
-        axes.plot(*points.T, color=colour, linewidth=1.8)
+    for (stage, (name, points)), color in zip(curves.items(), (BLUE, GREEN, ORANGE), strict=False):
+        axes.plot(*points.T, color=color, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
         late = points[-1, 0] > total / 2  # a label on the right of the curve's end would leave the chart
-        annotate(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
+        annotate(axes, words, points[-1], *(((-8, 4), color, "right") if late else ((6, 0), color)))
     for row, (stage, at) in enumerate(ends.items()):  # labels are staggered, as the points may be close in time
         axes.plot(*at, "D", color=INK, markersize=6)
         words = f"box of the test views\nafter {stage}: {at[1]:.2f}"
@@ -211,7 +211,7 @@ def _errors(
 def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> None:
     total = sum(seconds.values())
     for row, (stage, value) in enumerate(seconds.items()):
-        axes.barh(row, max(value, total / 500), left=begins[stage], color=GREY, height=0.62)
+        axes.barh(row, max(value, total / 500), left=begins[stage], color=GRAY, height=0.62)
         annotate(axes, format_duration(value), (begins[stage] + value, row), (5, 0))
     axes.set_yticks(range(len(seconds)), list(seconds))
     axes.set_ylim(len(seconds) - 0.4, -0.6)

@@ -27,7 +27,7 @@ from report.viewer_server import start_viewer_server
 PORT = 8080
 MOVING, STILL = 180, 480  # picture heights in px while the camera moves, and at rest
 FRUSTUM_SCALE = 0.04  # size of a drawn camera, in units of the scene's extent (1)
-# Width in px of the picture in the frustum, colour, and thickness of the lines.
+# Width in px of the picture in the frustum, color, and thickness of the lines.
 FRUSTUM_STYLES = {
     "cameras": (160, (20, 20, 20), FRUSTUM_SCALE / 40),
     "references": (480, (230, 120, 0), FRUSTUM_SCALE / 15),
@@ -80,7 +80,7 @@ def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
 
 
 def vertical_fov(camera: Camera) -> float:
-    """Return the vertical field of view in radians, as if the principal point were the image centre."""
+    """Return the vertical field of view in radians, as if the principal point were the image center."""
     return float(2 * np.arctan(camera.height / (2 * camera.fy)))
 
 

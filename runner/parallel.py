@@ -27,7 +27,7 @@ class SceneRun:
 
     Attributes:
         name: name for messages.
-        group: name of a group. Runs of a group share artifacts and thus run one after another; they must be neighbours
+        group: name of a group. Runs of a group share artifacts and thus run one after another; they must be neighbors
             in the list of runs.
         home: folder of the run in runs/.
         request: the scene and its options.
@@ -73,7 +73,7 @@ def run_all(
     is displayed instead.
 
     Args:
-        runs: the runs; those of a group must be neighbours.
+        runs: the runs; those of a group must be neighbors.
         execution: engine, and number of cores of each stage; its other settings are not used.
         hashes: the cache of hashes.
         stages: names of all stages, for the display of progress.

@@ -43,7 +43,7 @@ from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, Scene
 from reffusion.workspace import SURFACES
 
-TINT = (255, 0, 160)  # RGB colour that marks a remnant (a part of the object that the masks leave out) in its picture
+TINT = (255, 0, 160)  # RGB color that marks a remnant (a part of the object that the masks leave out) in its picture
 CHECKED_VIEWS = 8  # number of views in which Gaussians that the scene brings are compared with the photographs
 
 

@@ -67,7 +67,7 @@ def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> N
 
     There is one for each training view in `painted` with something to invent, and for up to `VIEWS_TO_PAINT` others
     that show most of what earlier views do not show of the hole. A view's template is <view>.png, the view without the
-    object and grey where it has to be invented, and <view>_mask.png, these pixels (its invent mask I). ranked.txt lists
+    object and gray where it has to be invented, and <view>_mask.png, these pixels (its invent mask I). ranked.txt lists
     the views and how much of the hole each adds to those before it.
 
     Args:

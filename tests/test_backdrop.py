@@ -1,4 +1,4 @@
-"""The backdrop, a sphere of blurred colours behind the scene, and the pixels of a view that no training view saw."""
+"""The backdrop, a sphere of blurred colors behind the scene, and the pixels of a view that no training view saw."""
 
 from dataclasses import replace
 

@@ -206,7 +206,7 @@ def do_all(*changes: Change) -> Change:
 
 
 def png_header(width: int, height: int, kind: int = 2) -> bytes:
-    """Return a PNG file that declares a size but has almost no pixel data; `kind` is the PNG colour type."""
+    """Return a PNG file that declares a size but has almost no pixel data; `kind` is the PNG color type."""
     chunk = lambda tag, data: struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
     header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     return (

@@ -74,7 +74,7 @@ def mask_shares(out: Path) -> dict[str, float]:
 
 
 def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
-    """Write pictures of the textured plane z = 0, and return the plane's colours at the truth's points.
+    """Write pictures of the textured plane z = 0, and return the plane's colors at the truth's points.
 
     Args:
         folder: the folder to write to.
@@ -236,7 +236,7 @@ def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
         run_with_warnings(folder, masks={"id": 7})
 
 
-def test_soft_edges_and_grey_objects_are_no_object_numbers(tmp_path):
+def test_soft_edges_and_gray_objects_are_no_object_numbers(tmp_path):
     rows, columns = np.mgrid[:100, :150]
     soft = np.clip(400 - 8 * np.hypot(rows - 50, columns - 70), 0, 255).astype(np.uint8)
     Image.fromarray(soft).save(tmp_path / "soft.png")
@@ -469,7 +469,7 @@ def test_mask_path_and_depth_file_path(tmp_path):
     assert f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json" in messages
 
 
-def test_a_16_bit_grey_photograph(tmp_path):
+def test_a_16_bit_gray_photograph(tmp_path):
     folder = write_capture(tmp_path / "s", "colmap", make_truth(PINHOLE))
     levels = np.tile(np.linspace(0, 65535, WIDTH).astype(np.uint16), (HEIGHT, 1))
     Image.fromarray(levels).save(folder / "images/v02.png")

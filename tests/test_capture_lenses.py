@@ -277,15 +277,15 @@ def test_depth_of_a_phone_makes_points(tmp_path, unit):
         assert_message(sentences, "depth_file_path")
 
 
-# ------------------------------------------------------------------------------------------------- 16 bits of grey
+# ------------------------------------------------------------------------------------------------- 16 bits of gray
 
 
 @pytest.mark.parametrize(
     ("ending", "order", "low", "high"),
     [(".tif", "<u2", 0, 4095), (".tiff", ">u2", 300, 64_000), (".png", "<u2", 7_000, 21_000)],
 )
-def test_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
-    """A ramp of grey stays a ramp, from a 12-bit camera, a big-endian scan, and a thermal camera."""
+def test_gray_photographs_of_16_bits(tmp_path, ending, order, low, high):
+    """A ramp of gray stays a ramp, from a 12-bit camera, a big-endian scan, and a thermal camera."""
     folder, truth = tmp_path / "s", make_truth()
     write_masks(folder / "masks", truth.world_to_camera)
     (folder / "images").mkdir()

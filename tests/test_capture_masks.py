@@ -250,7 +250,7 @@ def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
 def write_corner_capture(folder: Path, order: list[int]) -> Truth:
     """Write a capture of a room's corner whose pictures and COLMAP images have different names; return the truth.
 
-    The model has the images IMG_8.JPG to IMG_13.JPG, and points with the colours of the pictures. The picture
+    The model has the images IMG_8.JPG to IMG_13.JPG, and points with the colors of the pictures. The picture
     images_4/image00k.png shows view number `order[k]`.
     """
     generator, cameras = np.random.default_rng(5), room_walk(6)

@@ -34,7 +34,7 @@ def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
 
 
 def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
-    """Assert that all views have poses: rotations within 2 degrees, centres within 2 % of the extent of all centres."""
+    """Assert that all views have poses: rotations within 2 degrees, centers within 2 % of the extent of all centers."""
     assert sorted(scene.train) == sorted(truth)
     percents, degrees = pose_errors({name: scene.cameras[name].world_to_camera for name in scene.train}, truth)
     assert degrees.max() < 2 and percents.max() < 2

@@ -27,7 +27,7 @@ from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import correct_scene, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence, pick_by_size
-from reffusion.gaussians.neighbours import find_neighbours
+from reffusion.gaussians.neighbors import find_neighbors
 from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
@@ -86,7 +86,7 @@ def disk_picture(shape=(240, 320)):
     return (picture + noise).clip(0, 255).astype(np.uint8), disk
 
 
-def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
+def test_one_click_finds_what_is_of_one_color_and_another_the_rest():
     picture, disk = disk_picture()
     rows = np.mgrid[:240, :320][0]
     red = disk & (abs(rows - 120) >= 12)
@@ -98,7 +98,7 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
 
 def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     picture, disk = disk_picture()
-    # The background right of column 180 has the disk's colour and touches the disk.
+    # The background right of column 180 has the disk's color and touches the disk.
     picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))
     relief = np.where(disk, 0.0, 300.0)
     alone, flat = click_mask(picture, (150, 85)), click_mask(picture, (150, 85), relief=0 * relief)
@@ -358,7 +358,7 @@ def sheet_points(origin, along, up, color, step=0.04):
     """Place Gaussians on a grid with distance `step` on the parallelogram spanned by `along` and `up` at `origin`.
 
     Returns:
-        Means [n, 3] and colours [n, 3].
+        Means [n, 3] and colors [n, 3].
     """
     origin, along, up = (np.array(each, float) for each in (origin, along, up))
     rows, columns = (np.arange(step / 2, np.linalg.norm(each), step) / np.linalg.norm(each) for each in (up, along))
@@ -389,7 +389,7 @@ def box_scene():
 
 def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     scene, cameras, images, box = box_scene()
-    near, mask = find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
+    near, mask = find_neighbors(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
@@ -447,7 +447,7 @@ def test_the_middle_size_is_the_geometric_mean_of_the_others(size, pixels):
 
 @pytest.mark.parametrize("has_network", [True, False])
 def test_a_box_adds_and_removes_the_thing_inside_it(has_network):
-    """A red disk, 12 px in radius, is on grey ground; the network also knows the whole picture."""
+    """A red disk, 12 px in radius, is on gray ground; the network also knows the whole picture."""
     rows, columns = np.mgrid[:80, :100]
     disk = np.hypot(rows - 39.5, columns - 49.5) < 12
     picture = np.random.default_rng(0).integers(100, 140, (80, 100, 3)).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Colour differences of neighbouring views after reprojection, on planes whose warp is known in closed form."""
+"""Color differences of neighboring views after reprojection, on planes whose warp is known in closed form."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def turned_camera(name, x=0.0, angle=0.0):
 
 
 def render_plane(view, slope=0.0, shift=0.0):
-    """Return depth [H, W] and picture of the plane z = 2 + slope x; colours are linear in x and y, plus `shift`."""
+    """Return depth [H, W] and picture of the plane z = 2 + slope x; colors are linear in x and y, plus `shift`."""
     rays = world_rays(view)
     start = view.center
     depth = (2 + slope * start[0] - start[2]) / (rays[..., 2] - slope * rays[..., 0])
@@ -44,14 +44,14 @@ def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():
             assert value < 1.2 / 255 and share == 1.0
 
 
-def test_a_colour_that_changes_from_view_to_view_is_the_difference():
+def test_a_color_that_changes_from_view_to_view_is_the_difference():
     a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2), shift=0.2)
     value, share = consistency.reprojected_color_difference(a, b)
     assert value == pytest.approx(0.2, abs=1.2 / 255) and share == 1.0
 
 
 def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
-    """The difference equals the colour gradient times the shift of the pixels.
+    """The difference equals the color gradient times the shift of the pixels.
 
     At half its depth, a point lands 6 px off in a view 0.2 to the side. Red changes by 0.2 * 2 / 60 for each pixel.
     """
@@ -60,7 +60,7 @@ def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
     assert value == pytest.approx(6 * 0.2 * 2 / 60 / 3, abs=1.2 / 255)
 
 
-def test_what_the_neighbour_does_not_see_is_not_compared():
+def test_what_the_neighbor_does_not_see_is_not_compared():
     a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # a nearer surface occludes the left half of b
     poisoned = np.where((half < 1)[..., None], np.uint8(255), b.picture)
@@ -72,7 +72,7 @@ def test_what_the_neighbour_does_not_see_is_not_compared():
     assert consistency.reprojected_color_difference(a._replace(depth=np.zeros_like(a.depth)), b) == (None, 0.0)
 
 
-def test_where_the_neighbour_shows_nothing_at_all_it_disagrees():
+def test_where_the_neighbor_shows_nothing_at_all_it_disagrees():
     a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     empty = b._replace(depth=np.zeros_like(b.depth), picture=np.zeros_like(b.picture))
     value, share = consistency.reprojected_color_difference(a, empty)

@@ -118,9 +118,9 @@ def test_poses_bounds_model_and_truth_agree(mini_scene, generate):
 
 
 def test_sparse_points_lie_on_what_the_training_views_show(mini_scene):
-    """The sparse points have the colours of the pixels onto which they project.
+    """The sparse points have the colors of the pixels onto which they project.
 
-    The colours of pixels six columns away differ far more. Poses, lens and points are therefore consistent.
+    The colors of pixels six columns away differ far more. Poses, lens and points are therefore consistent.
     """
     truth = json.loads((mini_scene / "truth/cameras.json").read_text())
     model = colmap.load_model_points(mini_scene / "sparse/0/points3D.bin")

@@ -14,7 +14,7 @@ INNER = (ROWS > 14) & (ROWS < 34) & (COLUMNS > 20) & (COLUMNS < 45)
 
 
 def room_corner():
-    """Return the disparity [H, W] of a floor below a wall, and a picture [H, W, 3] in which the two colours differ."""
+    """Return the disparity [H, W] of a floor below a wall, and a picture [H, W, 3] in which the two colors differ."""
     floor, wall = 0.5 + 0.02 * (ROWS - 24.0), 0.5 + 0.001 * (COLUMNS - 32)
     picture = np.where((floor > wall)[..., None], (0.8, 0.5, 0.2), (0.3, 0.4, 0.6))
     return np.maximum(floor, wall), picture

@@ -368,7 +368,7 @@ def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior
     assert (inpaint.paint(prior, other, square_hole(), seeds=[1], **options)[0] == pair[1])[:, square_hole()].all()
 
 
-def test_painting_starts_from_the_hole_filled_with_the_colours_around_it(prior):
+def test_painting_starts_from_the_hole_filled_with_the_colors_around_it(prior):
     image, size = torch.full((3, 16, 16), 0.3), prior.native_size
     assert size == 16
     hole = torch.zeros(16, 16, dtype=torch.bool)

@@ -92,7 +92,7 @@ def test_test_views_that_contradict_their_poses_are_named(tmp_path, stage_folder
 def test_views_are_drawn_as_bright_as_photographs_are(stage_folders, tmp_path):
     """A test view gets the exposure of its photograph, measured outside the mask.
 
-    A test view without a photograph gets the exposure of the neighbouring training views. The consistency score is the
+    A test view without a photograph gets the exposure of the neighboring training views. The consistency score is the
     same as without exposures.
     """
     names = [f"view{k}" for k in range(3, 8)]

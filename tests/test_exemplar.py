@@ -163,7 +163,7 @@ def test_planks_run_on_in_their_own_perspective():
 
 
 def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
-    """Return the pixels of `picture` that show the floor within a distance of 1.2 from its centre."""
+    """Return the pixels of `picture` that show the floor within a distance of 1.2 from its center."""
     places = plane_frames.plane_coordinates(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
     return PlanePixels(np.stack([columns, rows], 1), places[rows, columns], picture)
@@ -172,7 +172,7 @@ def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
 def test_a_floor_of_planks_repeats_itself_by_their_width():
     found = find_symmetry(plane_pixels(paint_planks(CAMERAS[0]), CAMERAS[0]))
     across = (found.motions @ (1.0, 0.3)) / 0.12  # each shift's component across the planks, in plank widths
-    assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
+    assert found.center is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
     assert np.abs(across).max() > 2
 
 
@@ -188,7 +188,7 @@ def paint_tabletop(view: Camera) -> np.ndarray:
 def test_planks_that_meet_in_a_point_are_turned_about_it():
     found = find_symmetry(plane_pixels(paint_tabletop(CAMERAS[0]), CAMERAS[0]))
     turns = found.motions[:, 0] / (np.pi / 10)
-    assert np.linalg.norm(found.centre - (0.1, 0.4)) < 0.03
+    assert np.linalg.norm(found.center - (0.1, 0.4)) < 0.03
     assert np.abs(turns - turns.round()).max() < 0.15 and np.abs(turns).min() > 0.5 and np.abs(turns).max() > 4
     places = np.random.default_rng(0).normal(size=(50, 2))
     moved, step = found.move(places, found.motions[0]), 1e-4 * np.array([0.6, 0.8])
@@ -197,13 +197,13 @@ def test_planks_that_meet_in_a_point_are_turned_about_it():
     assert np.allclose(slope, step, atol=1e-9), "rotation() is the derivative of move()"
 
 
-def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
+def test_the_center_is_found_from_afar_though_a_part_of_the_top_is_seen():
     whole = plane_pixels(paint_tabletop(CAMERAS[0]), CAMERAS[0])
     right = whole.coordinates[:, 0] > -0.1
     seen, cell = PlanePixels(whole.pixels[right], whole.coordinates[right], whole.image), 2.4 / plane_symmetry.SIDE
     for away in ((6, -5), (-4, 6)):
-        centre, flat = plane_symmetry._refine_centre(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
-        assert flat is not None and np.linalg.norm(centre - (0.1, 0.4)) < 2 * cell, away
+        center, flat = plane_symmetry._refine_center(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
+        assert flat is not None and np.linalg.norm(center - (0.1, 0.4)) < 2 * cell, away
 
 
 def test_a_texture_without_period_has_no_symmetry():

@@ -169,7 +169,7 @@ def write_result(home: Path) -> tuple[Gaussians, Camera]:
 
 
 def check_reading(path: Path, made: Gaussians, camera: Camera, turn=(1, 1, 1)) -> None:
-    """Check positions, sizes, opacities and colours that another library read, and how they render.
+    """Check positions, sizes, opacities and colors that another library read, and how they render.
 
     Args:
         turn: signs of the axes of the frame in which it gives them.

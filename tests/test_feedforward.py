@@ -124,7 +124,7 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, si
     assert painted.dtype == np.uint8 and (painted[~inner] == image[~inner]).all()
     place = feedforward.crop_around(inner, side) if side else (slice(None), slice(None))
     known = image[place][~inner[place]].mean(0)
-    # If the output is resized, interpolation mixes colours at the border of the hole; compare away from the border.
+    # If the output is resized, interpolation mixes colors at the border of the hole; compare away from the border.
     middle = cv2.erode(inner.astype(np.uint8), np.ones((9, 9))) > 0
     assert np.abs(painted[middle if side else inner] - known).max() < (1.01 if not side else 4)
     noise = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)

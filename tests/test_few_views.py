@@ -44,7 +44,7 @@ def render_wall_and_square(view):
 
 
 def sample_wall_and_square(count=700, seed=0):
-    """Return points [count + 60, 3] and colours uint8 [count + 60, 3]: `count` of the whole wall, 60 of the square.
+    """Return points [count + 60, 3] and colors uint8 [count + 60, 3]: `count` of the whole wall, 60 of the square.
 
     Some of the wall's points lie behind the square.
     """
@@ -70,8 +70,8 @@ def test_a_slanted_plane_is_met_between_and_beyond_its_points():
     draw, view = np.random.default_rng(1), front_camera("a", 0.0)
     positions = np.column_stack([draw.uniform(-0.5, 0.5, 300), draw.uniform(-0.4, 0.4, 300), np.zeros(300)])
     positions[:, 2] = 2 + 0.5 * positions[:, 0] - 0.3 * positions[:, 1]
-    grey = np.full((view.height, view.width, 3), 128, np.uint8)
-    found = interpolate_depth(SparsePoints.of(positions, np.full((300, 3), 128, np.uint8)), view, grey)
+    gray = np.full((view.height, view.width, 3), 128, np.uint8)
+    found = interpolate_depth(SparsePoints.of(positions, np.full((300, 3), 128, np.uint8)), view, gray)
     rays = geometry.pixel_rays(view).reshape(view.height, view.width, 3)
     true = 2 / (1 - 0.5 * rays[..., 0] + 0.3 * rays[..., 1])
     assert np.abs(found / true - 1)[2:-2, 2:-2].max() < 2e-3
@@ -98,7 +98,7 @@ def test_too_few_points_tell_nothing():
 
 
 def aperiodic_color(points):
-    """Return uint8 [..., 3], the colours of points [..., 3] in a three-dimensional pattern without period."""
+    """Return uint8 [..., 3], the colors of points [..., 3] in a three-dimensional pattern without period."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = [np.sin(31 * x + 17 * y + 9 * z), np.sin(23 * y - 29 * x + 5), np.sin(41 * x * y + 37 * y), np.cos(53 * x)]
     return (127 + 30 * np.stack([waves[0] + waves[2], waves[1] + waves[3], waves[2] + waves[3]], -1)).astype(np.uint8)
@@ -123,13 +123,13 @@ def test_photographs_tell_a_slanted_plane_within_a_thousandth():
 
 
 def test_depth_stays_where_photographs_have_no_texture():
-    views, grey = [front_camera("a", 0.0), front_camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
+    views, gray = [front_camera("a", 0.0), front_camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
     believed = np.full((72, 96), 2.0)
-    planes = patchmatch.estimate_planes(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
+    planes = patchmatch.estimate_planes(views[0], gray, [(views[1], gray)], believed, np.random.default_rng(0))
     depth = 1 / (planes * geometry.pixel_rays(views[0])).sum(-1)
     assert np.abs(depth / believed - 1).max() < 1e-6
     away = front_camera("away", 50.0)  # this view does not show the surface
-    planes = patchmatch.estimate_planes(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
+    planes = patchmatch.estimate_planes(views[0], gray, [(away, gray)], believed, np.random.default_rng(0))
     assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
 
 
@@ -170,7 +170,7 @@ def test_points_behind_the_visible_surface_are_refuted():
     pictures = {view.name: render_aperiodic_square(view)[1] for view in views}
     positions = np.concatenate([wall, square])
     colors = aperiodic_color(positions)
-    # Wall points behind the square get the colour of the square, and outnumber the square's own points.
+    # Wall points behind the square get the color of the square, and outnumber the square's own points.
     uv, _ = geometry.project(wall, views[0])
     behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
     colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]

@@ -168,9 +168,9 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
 
 
 def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
-    """If neighbouring photographs have similar exposures, the nearest ones determine the exposure of a view.
+    """If neighboring photographs have similar exposures, the nearest ones determine the exposure of a view.
 
-    If neighbouring exposures differ, all photographs contribute.
+    If neighboring exposures differ, all photographs contribute.
     """
     cameras = arc_cameras(12)
     seen = [camera for k, camera in enumerate(cameras) if k % 3 != 1]
@@ -298,7 +298,7 @@ def test_wrong_input_is_refused_before_any_work(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_start_has_the_points_colours_and_spacing():
+def test_the_start_has_the_points_colors_and_spacing():
     grid = np.stack(np.meshgrid(*[np.arange(4) * 0.1] * 3), -1).reshape(-1, 3)
     colors = np.tile(np.array([[10, 128, 250]], np.uint8), (64, 1))
     gaussians = initial_gaussians(grid, colors, 2, 1000, seeding.generator(0))

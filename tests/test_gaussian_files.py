@@ -201,7 +201,7 @@ def test_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
 
 
 def test_splat_file(tmp_path):
-    """A .splat file has 32 bytes a Gaussian: position and sizes as floats; colour, opacity and rotation as bytes."""
+    """A .splat file has 32 bytes a Gaussian: position and sizes as floats; color, opacity and rotation as bytes."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(16)
     colors = np.random.default_rng(2).integers(0, 256, (16, 4)).astype(np.uint8)
     colors[:2, 3] = 255, 1

@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 96, 72
 OBJECT = np.zeros((HEIGHT, WIDTH), bool)
 OBJECT[20:44, 16:64] = True
 FULL = 255 * OBJECT.astype(np.uint8)
-# a picture of many colours, none of them near black
+# a picture of many colors, none of them near black
 NOISE = np.random.default_rng(0).integers(0, 256, (9, 12, 3), dtype=np.uint8)
 PHOTO = np.clip(cv2.resize(NOISE, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), 50, 255)
 REFUSED = "a photograph, not a mask; save white where the object is, black elsewhere"

@@ -80,7 +80,7 @@ def test_the_content_of_the_hole_does_not_matter():
     assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))
 
 
-def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone():
+def test_nothing_given_gives_gray_and_leaves_its_neighbors_in_the_batch_alone():
     images, hidden = signed_random_images(2, 3, 32, 32), disk_tensor(32, 32, 9).repeat(2, 1, 1, 1)
     hidden[0] = 1
     both = harmonic_extension(images, hidden)

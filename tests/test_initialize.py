@@ -120,7 +120,7 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
 
 
 def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
-    """With opaque Gaussians that occlude each other, colours that fit the reference are displaced in the opposite view.
+    """With opaque Gaussians that occlude each other, colors that fit the reference are displaced in the opposite view.
 
     The default settings of the new surface must reduce this error.
     """
@@ -193,10 +193,10 @@ def test_the_reference_is_reproduced_by_matched_colors():
     assert torch.equal(kept.sh, new.sh)
 
 
-def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
+def test_a_hidden_gaussian_does_not_become_a_speck_of_another_color():
     """New Gaussians behind a red sheet cannot reproduce the picture in this view.
 
-    Their colours must stay in the picture's range: an extreme colour would be visible from other views.
+    Their colors must stay in the picture's range: an extreme color would be visible from other views.
     """
     view = wall_scene.front_camera("v", 0.0)
     picture = np.random.default_rng(0).integers(110, 140, (wall_scene.HEIGHT, wall_scene.WIDTH, 3)).astype(np.uint8)

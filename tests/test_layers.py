@@ -33,8 +33,8 @@ def test_a_hole_is_label_surfaces_along_the_pictures_edge():
     assert (surfaces[hole & ~left] == surfaces[0, -1]).mean() > 0.97
 
 
-def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
-    """A star-shaped pattern has the colour of the other surface; its pixels get the label of the surface around it."""
+def test_a_pattern_in_the_colors_of_another_surface_is_no_island_of_it():
+    """A star-shaped pattern has the color of the other surface; its pixels get the label of the surface around it."""
     disparity, picture, hole = step_scene()
     rows, columns = np.mgrid[:100, :120]
     star = (np.abs(rows - 45) + np.abs(columns - 50)) < 7
@@ -42,8 +42,8 @@ def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
     assert (hole & star).sum() > 50 and (surfaces[star] == surfaces[0, 0]).all()
 
 
-def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
-    """Leaves on the ground have the colours of the nearer surface beside them.
+def test_where_other_views_look_past_a_surface_its_colors_are_another_ones():
+    """Leaves on the ground have the colors of the nearer surface beside them.
 
     If other views see past the nearer surface at the leaves (free space), the leaves get the depth of the ground.
     """
@@ -77,7 +77,7 @@ def vase_scene():
     The vase starts at column 80. It is nearer than the table behind it and touches the table at row 90.
 
     Returns:
-        Depth of the table's plane, depth of the scene, pixels of the vase, picture in three colours, hole: [H, W] each,
+        Depth of the table's plane, depth of the scene, pixels of the vase, picture in three colors, hole: [H, W] each,
         the picture [H, W, 3].
     """
     rows, columns = np.mgrid[:100, :120]
@@ -107,7 +107,7 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     assert (hole & vase).sum() > 200 and np.quantile(error, 0.97) < 0.01, message
 
 
-def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
+def test_a_tuft_of_the_grounds_own_colors_takes_nothing_of_the_ground():
     table, depth, vase, _, hole = vase_scene()
     grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
     known = ~dilate_by_distance(hole, 0.03)

@@ -79,7 +79,7 @@ def test_wrong_masks_are_refused():
         voting.cast_votes(one_gaussian(1.0), [wall_scene.front_camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
 
 
-def test_unseen_gaussians_take_the_label_of_their_neighbours():
+def test_unseen_gaussians_take_the_label_of_their_neighbors():
     views = [wall_scene.front_camera("v", -0.2), wall_scene.front_camera("w", 0.2)]
     ballots = {view.name: wall_scene.true_mask(view, 1.0) for view in views}
     aside = one_gaussian(1.0).map(lambda p: p.clone())

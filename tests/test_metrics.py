@@ -158,7 +158,7 @@ def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
 
 
 def test_flip_is_that_of_its_authors():
-    """The FLIP mean and map equal those of flip-evaluator, for random colours, odd image sizes and smooth images."""
+    """The FLIP mean and map equal those of flip-evaluator, for random colors, odd image sizes and smooth images."""
     import flip_evaluator
 
     draw = np.random.default_rng(3)

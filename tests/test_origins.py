@@ -43,7 +43,7 @@ def test_a_gap_shows_nothing():
     assert none.uncovered_share == 0 and set(none.shares.values()) == {0.0}
 
 
-def test_surfaces_that_most_photographs_show_in_another_colour_are_in_conflict():
+def test_surfaces_that_most_photographs_show_in_another_color_are_in_conflict():
     """The wall is as photographed on the left; on the right, where x > 0, the photographs are 60 levels darker."""
     cameras = [wall_scene.CAMERAS[name] for name in wall_scene.TRAIN]
     wall = wall_scene.wall_and_square(1.7)[0]

@@ -1,4 +1,4 @@
-"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colours.
+"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colors.
 
 C is the mask of the removed object in a view (consistent mask), I the mask of the invented pixels (invent mask).
 """
@@ -246,7 +246,7 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
     assert rows == [2, 2] and all(torch.equal(a, b) for a, b in zip(plain, guided, strict=True))
 
 
-def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
+def test_colors_above_1_are_shown_as_1_and_may_only_come_back():
     color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
     display = clamp_to_display(color)
     assert torch.equal(display, torch.tensor([0.0, 0.5, 1.0, 1.0]))
@@ -254,7 +254,7 @@ def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
     assert color.grad.tolist() == [0, 1, 1, 0]
 
 
-def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
+def test_no_term_shows_a_prior_or_a_critic_colors_above_1(prior, monkeypatch):
     gaussians, masked = random_wall()
     bright = replace(gaussians, sh=gaussians.sh + 3)
     seen = []

@@ -364,7 +364,7 @@ def test_depth_has_a_fallback_without_points():
         frame.depth_ranges(np.stack([np.eye(4)] * 4), pinholes, nothing, None)
 
 
-def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
+def test_random_points_are_seen_seeded_and_colored(tmp_path, monkeypatch):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
     monkeypatch.setattr(poses, "MORE_POINTS", 500)
@@ -378,7 +378,7 @@ def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
         uv = at[:, :2] / at[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         seen += (at[:, 2] > 0) & ((uv >= 0) & (uv <= (camera.width, camera.height))).all(axis=1)
     assert (seen >= 2).mean() > 0.95
-    assert set(np.unique(scene.point_colors)) == set(range(40, 46))  # the grey levels of the six pictures
+    assert set(np.unique(scene.point_colors)) == set(range(40, 46))  # the gray levels of the six pictures
 
 
 def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):

@@ -91,8 +91,8 @@ def test_a_folder_says_what_the_hole_shows(tiny_prior, tmp_path):
     file = folder / CONDITIONING
     for text in ('{"hole": "grey"}', None):
         file.write_text(text) if text else file.unlink()
-        grey = diffusion.conditioning(load_prior(folder), images, masks)
-        assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
+        gray = diffusion.conditioning(load_prior(folder), images, masks)
+        assert torch.equal(gray, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
     file.write_text('{"hole": "grey", "contrast": 0.5}')
     assert load_prior(folder).contrast == 0.5
     for text in (

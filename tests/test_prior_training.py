@@ -102,7 +102,7 @@ def test_a_folder_without_rooms_is_named(tmp_path):
         load_rooms(tmp_path, held_out=False)
 
 
-def test_an_error_of_the_latents_weighs_the_same_in_every_colour():
+def test_an_error_of_the_latents_weighs_the_same_in_every_color():
     """The gradient A^T (z - x0) of the pixels points where the pixels differ: A^T A is a multiple of the identity."""
     kernel = build.analysis()[:3, :, 1, 1]
     product = kernel.T @ kernel

@@ -63,7 +63,7 @@ def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):
 
 
 def test_guidance_changes_what_is_painted(pictures):
-    """Fillings of large holes without guidance and with a = 4 differ by two grey levels or more (rms in the hole)."""
+    """Fillings of large holes without guidance and with a = 4 differ by two gray levels or more (rms in the hole)."""
     prior, (pixels, masks, right, _) = load_prior(TINY), pictures
     large = (masks.mean((1, 2, 3)) > 0.65).nonzero().flatten()[:12].tolist()
     text, empty = diffusion.embed_text(prior, [right[k] for k in large]), diffusion.embed_text(prior, [""] * len(large))

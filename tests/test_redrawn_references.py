@@ -37,7 +37,7 @@ def paint_object(image: np.ndarray) -> np.ndarray:
 
 
 def shift_bands(image: np.ndarray, parallax: float) -> np.ndarray:
-    """Imitate a picture from a neighbouring position: bands move by 4 px, every second band by `parallax` px more."""
+    """Imitate a picture from a neighboring position: bands move by 4 px, every second band by `parallax` px more."""
     rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
     displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
     return cv2.remap(

@@ -446,7 +446,7 @@ def test_pictures_to_paint_are_exported_and_paintings_are_read_back(wall_folders
     photo, hidden = wall_scene.photo(wall_scene.CAMERAS[view]), wall_scene.true_mask(wall_scene.CAMERAS[view], 1.6)
     assert (
         np.array_equal(mask, wall_scene.true_unobserved(wall_scene.CAMERAS[view], 1.6))
-        and (picture[mask] == view_ranking.GREY).all()
+        and (picture[mask] == view_ranking.GRAY).all()
     )
     assert np.array_equal(picture[~hidden], photo[~hidden]) and psnr(picture, photo, hidden & ~mask) > 20
 
@@ -567,7 +567,7 @@ def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
 
 
 def test_contradicting_references_are_detected():
-    """References of two views of a wall agree if they show the same wall, and contradict if one has other colours."""
+    """References of two views of a wall agree if they show the same wall, and contradict if one has other colors."""
     views = [wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)]
     depth = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL)
     hole = np.zeros_like(depth, bool)

@@ -8,7 +8,7 @@ import torch
 from scenes import wall_scene
 from scenes.gaussians import join_gaussians
 
-from reffusion.gaussians.neighbours import find_neighbours, measure_overlap
+from reffusion.gaussians.neighbors import find_neighbors, measure_overlap
 from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.images import save_mask
 from reffusion.io.scene import load_warnings
@@ -100,7 +100,7 @@ def test_overlap_of_two_gaussians():
             means, quaternion.repeat(2, 1), scales.log().repeat(2, 1), torch.zeros(2), torch.zeros(2, 1, 3)
         )
         assert measure_overlap(pair, np.array([[0, 1]]))[0] == pytest.approx(np.exp(-((0.3 / 2 / deviation) ** 2) / 2))
-    assert find_neighbours(pair).pairs.tolist() == [[0, 1]]
+    assert find_neighbors(pair).pairs.tolist() == [[0, 1]]
 
 
 def test_densities_of_colors():

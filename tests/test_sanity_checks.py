@@ -73,8 +73,8 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
     directions = draws.standard_normal((40_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
-    colours = np.zeros((40_000, 3), np.uint8)
-    scene = make_scene(cameras, points=points, colors=colours)
+    colors = np.zeros((40_000, 3), np.uint8)
+    scene = make_scene(cameras, points=points, colors=colors)
     assert sanity._warn_inconsistent(scene, masks) == []
     moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
     assert sanity._warn_inconsistent(scene, moved) == [

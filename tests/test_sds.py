@@ -122,13 +122,13 @@ def test_matching_contrast_keeps_contrast_that_the_prior_adds():
 def test_matching_contrast_never_exceeds_the_render_and_stays_bounded():
     draw = generator(10)
     z, mask = torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64), torch.ones(1, 1, 8, 8, dtype=torch.float64)
-    centred = lambda x: x - x.mean((2, 3), keepdim=True)
+    centered = lambda x: x - x.mean((2, 3), keepdim=True)
     for size in (0.0, 1e-200, 1e-160, 1e-6, 0.3):
         x0 = size * torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64)
         clear = match_contrast(x0, z, mask)
-        assert (centred(clear).norm(dim=(2, 3)) <= centred(z).norm(dim=(2, 3)) * (1 + 1e-12)).all()
-        raised = centred(clear).norm(dim=(2, 3)) > centred(x0).norm(dim=(2, 3)) * (1 + 1e-9)
-        along = ((z - clear) * centred(clear)).sum((2, 3))
+        assert (centered(clear).norm(dim=(2, 3)) <= centered(z).norm(dim=(2, 3)) * (1 + 1e-12)).all()
+        raised = centered(clear).norm(dim=(2, 3)) > centered(x0).norm(dim=(2, 3)) * (1 + 1e-9)
+        along = ((z - clear) * centered(clear)).sum((2, 3))
         assert (along.abs() <= 1e-9)[raised].all(), "the gradient still changes the contrast"
     flat = torch.full_like(z, 0.4)
     torch.testing.assert_close(match_contrast(flat, z, mask), flat)

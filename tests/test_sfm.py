@@ -44,7 +44,7 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     turn = Rotation.from_rotvec((0.3, -0.5, 0.2)).as_matrix()
 
     def elsewhere(pose: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
-        """Move the camera centre by `shift`, and return the pose [4, 4] in a rotated, scaled and translated frame."""
+        """Move the camera center by `shift`, and return the pose [4, 4] in a rotated, scaled and translated frame."""
         center = 3 * turn @ (-pose[:3, :3].T @ pose[:3, 3] + shift) + (5, 6, 7)
         moved = np.eye(4)
         moved[:3, :3] = pose[:3, :3] @ turn.T
@@ -207,7 +207,7 @@ def test_demo_photos(tmp_path):
 
 @slow
 def test_bear(tmp_path):
-    """A dozen neighbouring photographs get the capture's poses, which COLMAP estimated from 96 photographs."""
+    """A dozen neighboring photographs get the capture's poses, which COLMAP estimated from 96 photographs."""
     capture = load_capture(real_capture("bear"))
     names = sorted(capture.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)

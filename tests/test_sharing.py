@@ -93,5 +93,5 @@ def test_a_rim_that_looks_like_the_photograph_is_left():
     image, mask, thing = photo.copy(), np.zeros((40, 40), bool), np.zeros((40, 40), bool)
     mask[8:32, 8:32] = thing[12:28, 12:28] = True
     image[thing] = (photo[thing].astype(int) + 128) % 256
-    image[18:22, 18:22] = photo[18:22, 18:22]  # here the object happens to have the photograph's colour
+    image[18:22, 18:22] = photo[18:22, 18:22]  # here the object happens to have the photograph's color
     assert np.array_equal(unchanged_rim(image, photo, mask), mask & ~thing)

@@ -39,8 +39,8 @@ def fill_and_mark(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarra
 
 def gradient_energy(image: np.ndarray) -> float:
     inner = HOLE[1:, 1:]
-    grey = image.astype(float).mean(2)
-    return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
+    gray = image.astype(float).mean(2)
+    return float((np.diff(gray, axis=0)[:, 1:][inner] ** 2 + np.diff(gray, axis=1)[1:][inner] ** 2).mean())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -60,9 +60,9 @@ def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
 
 
 def test_pixels_of_other_slope_or_layer_are_not_copied():
-    """The lower part of the picture is plain and has the lawn's colour, but another normal or layer than the hole.
+    """The lower part of the picture is plain and has the lawn's color, but another normal or layer than the hole.
 
-    Patches alone could not distinguish it from the lawn, so the hole would be filled with plain colour.
+    Patches alone could not distinguish it from the lawn, so the hole would be filled with plain color.
     """
     truth = paint_lawn(path=False)
     truth[80:] = (90, 100, 90)

@@ -24,7 +24,7 @@ NEAR = 1.7
 
 @pytest.fixture(scope="module")
 def reference_folders(tmp_path_factory):
-    """The folders of the stages up to `reference`, for a small scene with view-dependent colours."""
+    """The folders of the stages up to `reference`, for a small scene with view-dependent colors."""
     home = tmp_path_factory.mktemp("scene")
     poses, fit_folder, _ = wall_scene.write_poses_and_fit(home, NEAR)
     gaussians = load_ply(fit_folder / "gaussians.ply")

@@ -17,15 +17,15 @@ from reffusion.types import Camera, Gaussians
 CORNERS = (-0.3, -0.3, 0.0), (0.3, 0.3, 0.5)
 MEANS = torch.rand((500, 3), generator=torch.Generator().manual_seed(0)) * 0.6 - torch.tensor([0.3, 0.3, 0.0])
 LEAVES = 0.4  # share of the light that is left in the middle of the shadow
-GREY = np.array([0.55, 0.5, 0.45])
+GRAY = np.array([0.55, 0.5, 0.45])
 
 
 def tiles(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the colours of a floor of tiles whose brightness varies, with dark joints, [..., 3]."""
+    """Return the colors of a floor of tiles whose brightness varies, with dark joints, [..., 3]."""
     brightness = np.random.default_rng(0).uniform(0.85, 1.15, (64, 64))
     row, column = (np.floor(4 * each).astype(int) % 64 for each in (x, y))
     joint = np.minimum(4 * x % 1, 4 * y % 1) < 0.08
-    return (brightness[row, column] * np.where(joint, 0.5, 1.0))[..., None] * GREY
+    return (brightness[row, column] * np.where(joint, 0.5, 1.0))[..., None] * GRAY
 
 
 def soft_shadow(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def floor_view(number: int, color: Callable[[np.ndarray, np.ndarray], np.ndarray
 
 
 def background(color: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Background:
-    """Return the background of twelve views of a floor of the given colours."""
+    """Return the background of twelve views of a floor of the given colors."""
     pairs = [floor_view(number, color) for number in range(12)]
     photos = {view.camera.name: photo for view, photo in pairs}
     scene = Gaussians(MEANS, *(torch.zeros(500, n) for n in (4, 3)), torch.zeros(500), torch.zeros(500, 1, 3))
@@ -106,17 +106,17 @@ def test_a_shadow_is_read_as_it_was_written(shadow):
 
 
 def rug(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the colours of the floor with a dark rug that reaches below the box."""
+    """Return the colors of the floor with a dark rug that reaches below the box."""
     return tiles(x, y) * np.where((np.abs(x + 0.5) < 0.5) & (np.abs(y) < 0.4), 0.4, 1.0)[..., None]
 
 
 def stain(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the colours of the floor with a stain of soft borders, which changes red less than blue."""
+    """Return the colors of the floor with a stain of soft borders, which changes red less than blue."""
     return tiles(x, y) * soft_shadow(x, y) ** np.array([0.6, 1.0, 1.4])
 
 
 def far_shadow(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the colours of the floor with the shadow of something that stands elsewhere."""
+    """Return the colors of the floor with the shadow of something that stands elsewhere."""
     return tiles(x, y) * soft_shadow(x - 1.0, y - 1.0)
 
 

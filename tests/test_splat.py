@@ -21,7 +21,7 @@ IMAGES = ("color", "depth", "alpha", "features")
 
 
 def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
-    """Return a camera that sees the origin, slightly rotated and off-centre, so that no symmetry hides an error."""
+    """Return a camera that sees the origin, slightly rotated and off-center, so that no symmetry hides an error."""
     turn = 0.3
     pose = np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
@@ -30,7 +30,7 @@ def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
 
 
 def random_cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: float = 1.0) -> Gaussians:
-    """Return random Gaussians around the origin, with colours in and out of [0, 1] and some saturated opacities."""
+    """Return random Gaussians around the origin, with colors in and out of [0, 1] and some saturated opacities."""
     generator = torch.Generator().manual_seed(seed)
     normal = lambda *shape: torch.randn(*shape, generator=generator)
     higher = 0.15 * normal(count, (degree + 1) ** 2 - 1, 3)
@@ -283,7 +283,7 @@ def test_order_and_length_of_quaternions_do_not_matter_to_values():
 
 
 def extreme_gaussians() -> Gaussians:
-    """Return Gaussians behind the camera, at its centre, far to the side, huge, tiny, transparent and opaque."""
+    """Return Gaussians behind the camera, at its center, far to the side, huge, tiny, transparent and opaque."""
     center = torch.tensor(off_center_camera(20, 20).center, dtype=torch.float32)
     gaussians = random_cloud(10, -1.0)
     for array, row, value in (

@@ -166,7 +166,7 @@ def test_higher_harmonics_are_cut_to_degree_3(splat_file, degree):
         summarize_splats(path)
 
 
-def test_colours_in_bytes_stand_for_the_constant_harmonic(splat_file):
+def test_colors_in_bytes_stand_for_the_constant_harmonic(splat_file):
     path, table = splat_file
     colors = np.random.default_rng(0).integers(0, 256, (3, COUNT)).astype(np.uint8)
     without = tuple(n for n in table.dtype.names if n.startswith("f_"))

@@ -1,4 +1,4 @@
-"""Completed surfaces: their depth from photo-consistency, and their view-dependent colour from the surroundings."""
+"""Completed surfaces: their depth from photo-consistency, and their view-dependent color from the surroundings."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def intersect_ground(view: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reflection(way: np.ndarray) -> np.ndarray:
-    """Return the reflection [..., 1] that is added to the ground's colour; it is stronger if seen from the right.
+    """Return the reflection [..., 1] that is added to the ground's color; it is stronger if seen from the right.
 
     Args:
         way: [..., 3], the direction from the ground to the camera.
@@ -100,7 +100,7 @@ def test_a_plane_moves_onto_what_is_known_around_the_hole():
 
 
 def hole_gaussians(sh_degree: int) -> Gaussians:
-    """Return Gaussians on the ground in the hole, whose colours are those of the first view in all directions."""
+    """Return Gaussians on the ground in the hole, whose colors are those of the first view in all directions."""
     view = CAMERAS[0]
     points, picture = intersect_ground(view)[1][HOLE], paint_ground(view, shines=True)[HOLE] / 255
     return round_gaussians(points, picture, np.exp(-4.0), 2.0, (sh_degree + 1) ** 2)

@@ -20,7 +20,7 @@ NO_POINTS = np.zeros((0, 3))
 SIZE, FOCAL = 320, 330.0
 WIDE, DEEP, HIGH = 0.4, 0.25, 0.7  # half axes of the vase, and its height
 LOW, UPPER = np.array([-0.75, -0.75, 0.0]), np.array([-0.2, -0.3, 0.5])  # corners of the box before its left half
-CENTRE, RADIUS = (LOW + UPPER) / 2, 0.45
+CENTER, RADIUS = (LOW + UPPER) / 2, 0.45
 
 
 def vase_camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
@@ -68,7 +68,7 @@ def vase_depth_view(view: Camera, cut: bool = False) -> DepthView:
 
 
 def vase_color(points: np.ndarray, halved: bool) -> np.ndarray:
-    """Return the vase's colours [..., 3], a pattern of bands; `halved` gives its two halves different colours."""
+    """Return the vase's colors [..., 3], a pattern of bands; `halved` gives its two halves different colors."""
     bands = 0.5 + 0.3 * np.sin(9 * points[..., 2])
     half = np.where(points[..., 0] > 0, 1 - bands, bands) if halved else bands
     return np.stack([half, 0.8 * half, 0.5 * bands], -1)
@@ -98,8 +98,8 @@ def select_left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
 @pytest.fixture(scope="module")
 def vase_mirrors():
     views, photos, gaussians = make_vase_scene()
-    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
-    return views, gaussians, planes, find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos)
+    planes = find_planes(CENTER, RADIUS, views, NO_POINTS)
+    return views, gaussians, planes, find_mirrors(gaussians, CENTER, RADIUS, views, planes, photos)
 
 
 def test_a_vase_is_its_own_mirror_image(vase_mirrors):
@@ -139,15 +139,15 @@ def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
 def test_an_asymmetric_object_has_no_mirror(how):
     views, photos, gaussians = make_vase_scene(**how)
-    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
-    assert not select_left_right_mirrors(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
+    planes = find_planes(CENTER, RADIUS, views, NO_POINTS)
+    assert not select_left_right_mirrors(find_mirrors(gaussians, CENTER, RADIUS, views, planes, photos))
 
 
 def test_without_an_object_there_is_no_mirror():
     views, photos, gaussians = make_vase_scene()
-    assert find_mirrors(gaussians, CENTRE, RADIUS, views, [], photos) == []
-    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
-    assert find_mirrors(gaussians, CENTRE, np.inf, views, planes, photos) == []
+    assert find_mirrors(gaussians, CENTER, RADIUS, views, [], photos) == []
+    planes = find_planes(CENTER, RADIUS, views, NO_POINTS)
+    assert find_mirrors(gaussians, CENTER, np.inf, views, planes, photos) == []
 
 
 def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():

@@ -169,8 +169,8 @@ def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_vi
     camera = table_views[0].camera
     rays = world_rays(camera)
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
-    grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
-    floaters = surface_gaussians(grey, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
+    gray = np.full((SIZE, SIZE, 3), 128, np.uint8)
+    floaters = surface_gaussians(gray, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
     hidden = render_table(camera)[1] & render_table(camera)[2]
 
     def shows_it(view):
@@ -253,7 +253,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"
 
 
-def test_gaussians_of_other_colours_than_gravel_are_debris():
+def test_gaussians_of_other_colors_than_gravel_are_debris():
     """Before rough ground nearly all Gaussians count as seen. The teal ones, remains of the object, must be found."""
     view = table_camera("v", 0, 2.0)
     depth, _, _ = render_table(view)
@@ -262,7 +262,7 @@ def test_gaussians_of_other_colours_than_gravel_are_debris():
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
     place = geometry.unproject(rough.astype(float), view)[80:84, 80]
     sh = torch.zeros(4, 1, 3)
-    sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are grey
+    sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are gray
     parts = torch.tensor(place).float(), torch.zeros(4, 4), torch.full((4, 3), -4.0), torch.zeros(4), sh
     assert count_color_mismatches(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
     smooth = DepthView.from_range(view, depth, depth_range(np.full_like(depth, depth[80, 80])), witness.masked)

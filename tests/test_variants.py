@@ -405,7 +405,7 @@ def test_rendered_views_inpainted_in_2d(masked_scene, tmp_path):
 
 
 def test_the_masked_fit_never_sees_a_masked_pixel(masked_scene, tmp_path):
-    """Noise in the masked pixels of the photographs and another colour of the object give identical Gaussians."""
+    """Noise in the masked pixels of the photographs and another color of the object give identical Gaussians."""
     values = {"iterations": 12, "sh.degree": 0, "init.flow_cell": 6, "densify.cap_max": 1500, "densify.every": 4}
     params = fit.Params(pixels="unmasked").changed(values)
     found = []

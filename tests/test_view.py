@@ -67,11 +67,11 @@ def visitor_camera(camera):
 def test_a_visitor_who_stands_at_a_view_sees_that_view():
     gaussians, _ = wall_scene.wall_and_square(1.0)
     for camera in wall_scene.CAMERAS.values():
-        centred = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
-        seen = view.visitor_camera(visitor_camera(centred), centred.height)
-        assert (seen.width, seen.height) == (centred.width, centred.height)
-        assert np.allclose(seen.world_to_camera, centred.world_to_camera)
-        expected = (rasterizer.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
+        centered = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
+        seen = view.visitor_camera(visitor_camera(centered), centered.height)
+        assert (seen.width, seen.height) == (centered.width, centered.height)
+        assert np.allclose(seen.world_to_camera, centered.world_to_camera)
+        expected = (rasterizer.render(gaussians, centered).color.clamp(0, 1) * 255).round().byte().numpy()
         assert np.abs(view.render_picture(gaussians, seen).astype(int) - expected).max() <= 1
 
 

@@ -1,6 +1,6 @@
 """Speed of CPU splatting: `python -m benchmarks.bench.large [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
 
-A *step* is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, with
+A *step* is one rendering (color, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, with
 all sizes measured in turn; the scaling with threads is measured in wall time. Columns:
 
   pairs      millions of pixel-Gaussian pairs that are blended, by the oracle's rule
@@ -47,8 +47,8 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 
 SIZES = ("5000@256x192", "20000@320x240", "100000@512x384", "100000@1008x756", "500000@1008x756")
 PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the target's seconds, and its machine's GF/s
-# Operations per pair. Forward: u; log2 alpha; exp2; weight and transmittance; colour, depth, alpha. Backward: the first
-# four again; shade; colours; remainder; g; the moments of g.
+# Operations per pair. Forward: u; log2 alpha; exp2; weight and transmittance; color, depth, alpha. Backward: the first
+# four again; shade; colors; remainder; g; the moments of g.
 FORWARD_OPERATIONS = 2 + 4 + 13 + 3 + 9
 BACKWARD_OPERATIONS = 2 + 4 + 13 + 3 + 7 + 8 + 2 + 5 + 5
 LAYERS = 35  # approximate number of Gaussians over each pixel, including occluded ones

@@ -27,7 +27,7 @@ def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         truth: [H, W], disparity of three slanted planes that meet.
         target: [H, W], the truth with noise, 0 in the hole.
         confidence: [H, W], 0 in a round hole over the creases between the planes, else 1.
-        guide: uint8 [H, W, 3], a picture whose colours change from plane to plane.
+        guide: uint8 [H, W, 3], a picture whose colors change from plane to plane.
         part: [H, W], index of the plane.
     """
     random = np.random.default_rng(seeding.seed_for(seed, "solvers"))

@@ -53,7 +53,7 @@ def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tens
     """Render the Gaussians with an implementation of the rasterizer, forward and backward.
 
     Returns:
-        The colours [H, W, 3], and the gradients of a fixed linear function of the colours with respect to each of
+        The colors [H, W, 3], and the gradients of a fixed linear function of the colors with respect to each of
         `PARAMETERS`.
     """
     leaves = gaussians.map(lambda p: p.detach().clone().requires_grad_())

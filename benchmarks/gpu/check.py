@@ -1,6 +1,6 @@
 """Check of the method at the paper's sizes on this GPU: correctness, speed and memory. No part starts after 8 minutes.
 
-- gsplat against the float64 oracle (plain torch): colour, depth, alpha, features and their gradients, and the sums of
+- gsplat against the float64 oracle (plain torch): color, depth, alpha, features and their gradients, and the sums of
   blending weights; the same antialiased, and in a crop; SSIM and its gradient.
 - One step of each loss at the paper's sizes with the full-size SD2-inpainting: seconds per step (median of three),
   memory allocated and reserved. The weights are the published ones if they are on this machine, else random ones of the

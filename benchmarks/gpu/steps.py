@@ -170,7 +170,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
 
 
 def fit_scene(bench: Bench) -> dict[str, Any]:
-    """Fit Gaussians to renders of known Gaussians, starting from shifted Gaussians with weaker colours.
+    """Fit Gaussians to renders of known Gaussians, starting from shifted Gaussians with weaker colors.
 
     Returns:
         "size" of the images, "images_per_second" (steps per second of the fit), "psnr_before" and "psnr_after" of the

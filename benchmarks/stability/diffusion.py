@@ -171,7 +171,7 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
 def levels_error(known_share: float) -> float:
     """Return the largest error of pictures at the model's levels, and of those restored, against float64.
 
-    The pictures are dark, grey or bright, of contrasts from 1e-8 to 1. The error at the model's levels is relative to
+    The pictures are dark, gray or bright, of contrasts from 1e-8 to 1. The error at the model's levels is relative to
     the largest possible gain.
 
     Args:

@@ -35,7 +35,7 @@ EXPORT_TOLERANCE = 1e-5  # accuracy of exported positions that `save_ply` guaran
 
 
 def true_gaussians() -> Gaussians:
-    """Make the ground truth of the photographs: sixty coloured Gaussians in a box of extent 1 around the origin."""
+    """Make the ground truth of the photographs: sixty colored Gaussians in a box of extent 1 around the origin."""
     random = seeding.generator(0, "stability", "truth")
     uniform = lambda *shape: torch.rand(*shape, generator=random)
     return Gaussians(
@@ -49,7 +49,7 @@ def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
 
     Args:
         extent: extent of the scene in its own frame.
-        offset: [3], position of the box's centre in the scene's own frame.
+        offset: [3], position of the box's center in the scene's own frame.
     """
     found = {}
     for k in range(VIEWS):
@@ -66,7 +66,7 @@ def normalized_scene(extent: float, offset: float) -> Scene:
 
     Args:
         extent: extent of the scene in its own frame.
-        offset: x coordinate of the scene's centre in its own frame, in extents. The centre lies in the direction
+        offset: x coordinate of the scene's center in its own frame, in extents. The center lies in the direction
             `OFFSET_DIRECTION`.
     """
     place = extent * offset * OFFSET_DIRECTION
@@ -158,9 +158,9 @@ def scale_error(extent: float, offset: float) -> float:
 
 
 def export_picture_error(extent: float, offset: float) -> float:
-    """Return the largest colour difference between one view of the fit and of its export.
+    """Return the largest color difference between one view of the fit and of its export.
 
-    The export is loaded into the normalised frame. Colours are in [0, 1].
+    The export is loaded into the normalised frame. Colors are in [0, 1].
     """
     scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:

@@ -76,8 +76,8 @@ def constant_flip() -> float:
 
 def one_pixel() -> float:
     """Count wrong scores of images of 1 x 1 px: PSNR and FLIP must be right and finite, SSIM None."""
-    black, grey = flat(0.0, 1, 1), flat(0.5, 1, 1)
-    scores = image_metrics.score(black, grey)
+    black, gray = flat(0.0, 1, 1), flat(0.5, 1, 1)
+    scores = image_metrics.score(black, gray)
     good = abs(scores["psnr"] + 20 * math.log10(0.5)) < 1e-9, 0 < scores["flip"] <= 1, scores["ssim"] is None
     return float(3 - sum(good))
 
@@ -137,7 +137,7 @@ def loss_of_constant_images() -> float:
 
 
 def loss_of_one_pixel() -> float:
-    """Return the error of the reconstruction loss of 1 x 1 px, grey against black.
+    """Return the error of the reconstruction loss of 1 x 1 px, gray against black.
 
     The exact value is 0.8 * 0.5 + 0.2 * (1 - C1 / (0.25 + C1)).
     """

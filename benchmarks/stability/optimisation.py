@@ -81,7 +81,7 @@ def fast_distillation_fails(factor: float) -> float:
     """Return 0 if a distillation with too large learning rates improves the PSNR or stops with a clear error, else 1.
 
     A clear error names the step and the term that failed. All values and the trace must be finite. The terms are
-    reconstruction and reference. About half of the Gaussians are masked and start in grey.
+    reconstruction and reference. About half of the Gaussians are masked and start in gray.
 
     Args:
         factor: factor on the usual learning rates.

@@ -72,7 +72,7 @@ def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
     """Draw an extreme scene.
 
     Standard deviations are 1e-7 to 1e4 extents, anisotropies up to 1e6, opacity logits up to 30 in size. Quaternions
-    have any length, also 0. Gaussians may be near the near plane, behind the camera, or at its centre.
+    have any length, also 0. Gaussians may be near the near plane, behind the camera, or at its center.
     """
     count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 0.125, 4.0), _between(random, 0.25, 10.0))
@@ -89,7 +89,7 @@ def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
 
 
 def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
-    """Draw a mean [3] in the scene, near the near plane, behind the camera, at the camera's centre, or far away."""
+    """Draw a mean [3] in the scene, near the near plane, behind the camera, at the camera's center, or far away."""
     kind = random.choice(("scene", "scene", "near plane", "behind", "centre", "far"))
     if kind == "scene":
         return 0.4 * random.normal(size=3)

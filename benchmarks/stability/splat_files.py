@@ -92,7 +92,7 @@ def clamping_error(gradients: bool) -> float:
     infinite.
 
     Args:
-        gradients: False compares the pictures and returns the largest difference of a colour. True compares the
+        gradients: False compares the pictures and returns the largest difference of a color. True compares the
             gradients of each parameter and returns the largest L2 difference, relative to the gradient's norm.
 
     Returns:

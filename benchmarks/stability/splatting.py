@@ -25,7 +25,7 @@ QUANTITY = "relative L2 error of the worst value or gradient block against float
 
 
 def camera(width: int = 12, height: int = 10, distance: float = 1.0) -> Camera:
-    """Make a camera that looks at the origin, slightly turned and off-centre, so that no symmetry hides an error."""
+    """Make a camera that looks at the origin, slightly turned and off-center, so that no symmetry hides an error."""
     turn, pose = 0.3, np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
     pose[:3, 3] = 0.02, -0.01, distance
@@ -161,7 +161,7 @@ def move_behind_camera(gaussians: Gaussians) -> Gaussians:
 
 
 def move_to_camera_center(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians with two at the camera's centre, and one 1e-30 in front of it."""
+    """Return the Gaussians with two at the camera's center, and one 1e-30 in front of it."""
     means = gaussians.means.clone()
     means[:3] = world_from_camera([[0, 0, 0], [0, 0, 0], [0, 0, 1e-30]], camera())
     return replace(gaussians, means=means)
@@ -176,7 +176,7 @@ def unrotated_camera() -> Camera:
 
 
 def make_far_needles(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians as needles whose centres are 1e4 extents away and that nevertheless cross the image.
+    """Return the Gaussians as needles whose centers are 1e4 extents away and that nevertheless cross the image.
 
     Their standard deviations are 2e4 along the needle and 1e-2 across it.
     """
@@ -210,7 +210,7 @@ def move_to_origin(gaussians: Gaussians) -> Gaussians:
 
 
 def wide_image_error() -> float:
-    """Return the relative L2 error of the colour of an image of 8192 x 2 px.
+    """Return the relative L2 error of the color of an image of 8192 x 2 px.
 
     Footprints span a thousand tiles, and pixel coordinates have only 11 fractional bits in float32. The image has too
     many pixels for `oracle.blended_pixels`, so only values are compared, and the float64 reference decides on its own

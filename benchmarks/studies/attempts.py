@@ -152,7 +152,7 @@ def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):
             style = "--" if "no SDS" in attempt else ":" if attempt.startswith("free") else "-"
-            color = f"C{index % 10}" if index < 10 or style != "-" else charts.INK  # there are ten colours
+            color = f"C{index % 10}" if index < 10 or style != "-" else charts.INK  # there are ten colors
             look = {"color": color, "linestyle": style, "linewidth": 1.5}
             points = np.array([(line["seconds"], line[name]) for line in lines])
             axes.plot(*points.T, label=attempt, **look)

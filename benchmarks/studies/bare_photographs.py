@@ -1,9 +1,9 @@
 """Accuracy of poses found from photographs alone: `python -m benchmarks.studies.bare_photographs ../shared/data/fox`.
 
 The stage `poses` gets the photographs of captures with known poses, but not these poses, and finds poses by structure
-from motion. The found poses are aligned to the known ones by the best similarity transform. Errors of camera centres
-are in % of the extent (the largest distance between two centres), errors of rotations in degrees. Structure from motion
-does not estimate the principal point; a principal point off the image centre appears as an error of the rotations. The
+from motion. The found poses are aligned to the known ones by the best similarity transform. Errors of camera centers
+are in % of the extent (the largest distance between two centers), errors of rotations in degrees. Structure from motion
+does not estimate the principal point; a principal point off the image center appears as an error of the rotations. The
 study prints two rows per capture, before and after the adjustment to optical flow (`poses.refine`), and writes
 bare_photographs.json to --out.
 """
@@ -42,14 +42,14 @@ COLUMNS = (
 
 
 def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare poses after the similarity transform of the estimate that aligns the camera centres best (least squares).
+    """Compare poses after the similarity transform of the estimate that aligns the camera centers best (least squares).
 
     Args:
         estimate: view -> world-to-camera pose [4, 4].
         truth: view -> world-to-camera pose [4, 4].
 
     Returns:
-        For the V views that both have, sorted by name: distances of centres [V] in % of the extent of the true centres
+        For the V views that both have, sorted by name: distances of centers [V] in % of the extent of the true centers
         (the largest distance between two of these), and rotation errors [V] in degrees.
     """
     names = sorted(set(estimate) & set(truth))

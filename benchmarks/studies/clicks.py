@@ -44,7 +44,7 @@ TINT = (255, 0, 160)
 def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     """Return the next click as (x, y, on the object), where the mask is most wrong.
 
-    The click is the centre, in px, of the pixel deepest inside the missing or the superfluous regions of the mask. It
+    The click is the center, in px, of the pixel deepest inside the missing or the superfluous regions of the mask. It
     is on the object (True) if the region is missing.
 
     Args:

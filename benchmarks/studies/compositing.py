@@ -23,7 +23,7 @@ SAMPLES = 3  # rays per side of a pixel
 DARKEST, SQUARES = 0.45, 3  # ambient light; squares of the checkerboard along half an edge of the object
 LIGHT = (0.9, -0.2, 1.0)  # direction to the light, along the object's axes
 CELL = 12  # side of image cells, px; in each cell only the nearest sparse points are used
-# Centre and reach of the shadow on the surface along the object's first two axes, relative to its height.
+# Center and reach of the shadow on the surface along the object's first two axes, relative to its height.
 SHADOW_AT, SHADOW_REACH = (
     (-0.8, 0.15),
     (0.95, 0.8),
@@ -39,7 +39,7 @@ class Options:
             scene has no reference.
         shadow: strength of the object's soft shadow on the surface, 0 to 1. Masks do not contain the shadow.
         rough: largest perturbation of training masks, px: each is dilated or eroded, and shifted, at random.
-        seed: seed of the object's colours and of the masks' perturbations.
+        seed: seed of the object's colors and of the masks' perturbations.
     """
 
     reference: bool = True
@@ -79,7 +79,7 @@ class PixelRays:
 
     @cached_property
     def coarse(self) -> np.ndarray:
-        """Rays through the pixel centres."""
+        """Rays through the pixel centers."""
         return self.rays(1)
 
     def mean(self, values: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ def render_object(
         view: rays of the capture.
         camera: camera-to-world matrix [4, 4].
         thing: the object.
-        tints: [3, 3], RGB colours in [0, 1] of the faces of each axis; an ellipsoid has the first one only.
+        tints: [3, 3], RGB colors in [0, 1] of the faces of each axis; an ellipsoid has the first one only.
 
     Returns:
         RGB [H, W, 3] multiplied by the coverage, and the coverage [H, W], all in [0, 1].

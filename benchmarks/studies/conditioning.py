@@ -1,7 +1,7 @@
 """Effect of preconditioning and scaling of linear systems: `python -m benchmarks.studies.conditioning`.
 
 The study measures the three linear systems of depth estimation in two forms each. Alignment: plain normal equations
-against centred and scaled ones. Bilateral solver: conjugate gradients with and without Jacobi preconditioning.
+against centered and scaled ones. Bilateral solver: conjugate gradients with and without Jacobi preconditioning.
 Completion: the system for disparity itself against the system for the correction to a plane. It prints errors and
 condition numbers, and draws them to --out.
 """

@@ -159,7 +159,7 @@ def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
-    """Return the mean squared difference of brightness between neighbouring pixels that are both in the hole."""
+    """Return the mean squared difference of brightness between neighboring pixels that are both in the hole."""
     light, total, count = picture.mean(2) / 255, 0.0, 0
     for axis in (0, 1):
         both = np.logical_and(*(hole.take(range(k, hole.shape[axis] - 1 + k), axis) for k in (0, 1)))
@@ -207,7 +207,7 @@ def fill_holes(
 
 
 def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
-    """Save the picture with its hole in grey, the fillings and the truth side by side."""
+    """Save the picture with its hole in gray, the fillings and the truth side by side."""
     path.parent.mkdir(parents=True, exist_ok=True)
     hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
     save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))

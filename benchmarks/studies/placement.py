@@ -118,7 +118,7 @@ class PlacedObject:
 
     @property
     def middle(self) -> np.ndarray:
-        """Centre [3] of the object."""
+        """Center [3] of the object."""
         return self.foot + self.normal * self.half[2]
 
 

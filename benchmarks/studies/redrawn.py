@@ -28,8 +28,8 @@ from reffusion.io.images import load_image
 from reffusion.references import registration
 
 LONGER_SIDE = 640  # px to which photographs are reduced
-NEAREST = 2  # number of neighbouring views whose photographs are given as wrong references of each view
-COMPARED = 4  # number of neighbouring photographs with which a reference is compared
+NEAREST = 2  # number of neighboring views whose photographs are given as wrong references of each view
+COMPARED = 4  # number of neighboring photographs with which a reference is compared
 CHOSEN_ON = ("bear", "garden", "statue", "fox")  # captures on which thresholds were chosen; other captures only report
 
 
@@ -76,7 +76,7 @@ def sharpen(image: np.ndarray) -> np.ndarray:
 
 
 def tint(image: np.ndarray) -> np.ndarray:
-    """Give a picture a warm colour cast."""
+    """Give a picture a warm color cast."""
     return _to_picture(image * np.array([1.08, 1.0, 0.88]) + np.array([0, 4, 8]))
 
 
@@ -130,12 +130,12 @@ class Photographs:
     def nearest(self, view: str) -> list[str]:
         """Return the names of all other views, nearest first.
 
-        The distance of another view is that of its centre, divided by the median of the distances of all other views'
-        centres, plus twice the angle between the optical axes in radians.
+        The distance of another view is that of its center, divided by the median of the distances of all other views'
+        centers, plus twice the angle between the optical axes in radians.
         """
-        centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
+        center = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
-        distance = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
+        distance = {name: float(np.linalg.norm(center[name] - center[view])) for name in others}
         axis = self.world_to_camera[view][2, :3]
         cosine = {name: np.clip(self.world_to_camera[name][2, :3] @ axis, -1, 1) for name in others}
         usual = float(np.median(list(distance.values())))
@@ -177,12 +177,12 @@ class Rates:
 
     Attributes:
         own: inlier ratios of pictures that must be accepted.
-        other: inlier ratios of photographs of neighbouring views.
+        other: inlier ratios of photographs of neighboring views.
         foreign: inlier ratios of the photograph of another capture.
         refused: number of right pictures that were refused.
-        accepted_by_place: number of photographs of neighbouring views that would be accepted by the inlier ratio alone,
+        accepted_by_place: number of photographs of neighboring views that would be accepted by the inlier ratio alone,
             without comparison with other photographs.
-        accepted: number of wrong pictures, of neighbouring views and of another capture, that were accepted.
+        accepted: number of wrong pictures, of neighboring views and of another capture, that were accepted.
     """
 
     own: list[float] = field(default_factory=list)
@@ -226,7 +226,7 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         for number, make in enumerate(VARIANTS.values()):
             image = fit_size(make(redrawn), photo)
             registered = registration.register(image, photo, hole)
-            # To save time, only one variant per view is also compared with the photographs of neighbouring views.
+            # To save time, only one variant per view is also compared with the photographs of neighboring views.
             compare = number == index % len(VARIANTS)
             wrong = not registered.fits or (compare and registration.find_better_view(image, registered, others))
             rates.own.append(registered.inlier_ratio)

@@ -40,7 +40,7 @@ METHODS = {  # method -> options of the runner
     BOTH: (),
     PLAIN: ("--variant=remove_only", f"--set={POINTS}"),
 }
-COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
+COLORS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 
 
 def make_scene(scene: Path, count: int, folder: Path) -> Path:
@@ -102,7 +102,7 @@ def draw(scores: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> No
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
         for way, counts in scores.items():
             means = [np.mean([each[score] for each in scenes]) for scenes in counts.values()]
-            axes.plot([int(count) for count in counts], means, "o-", color=COLOURS[way], label=way)
+            axes.plot([int(count) for count in counts], means, "o-", color=COLORS[way], label=way)
         axes.set(xscale="log", xlabel="views with pixels", ylabel=title)
         charts.use_plain_log_ticks(axes)
         counts = sorted({int(count) for each in scores.values() for count in each})

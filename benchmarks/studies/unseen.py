@@ -8,7 +8,7 @@ prior, because the pictures need not agree with each other.
 The prior is used as it is ("base"), personalized to the references ("reference"), and personalized to the references
 and the scene's photographs, in which the initialization replaces the object ("photographs"). Each paints in the `WAYS`.
 Scored is LPIPS (VGG and AlexNet): the mean of its map over the unseen pixels, against the ground truth. The study
-prints a table, and writes unseen.json and rows of pictures (unseen pixels in grey, patches, all paintings, truth).
+prints a table, and writes unseen.json and rows of pictures (unseen pixels in gray, patches, all paintings, truth).
 """
 
 from __future__ import annotations

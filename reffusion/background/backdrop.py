@@ -2,7 +2,7 @@
 
 Outside the image areas of all training views a fit has no Gaussians, or Gaussians that no photograph supervised. New
 views that look in these directions show black holes and blobs. Gaussians that the training views hardly see are
-therefore removed, and the sphere is added behind everything. Each of its disks has the blurred colour of the surfaces
+therefore removed, and the sphere is added behind everything. Each of its disks has the blurred color of the surfaces
 that lie in about the same direction. (Alternatives that were measured: docs/results.md#backdrop.)
 """
 
@@ -22,24 +22,24 @@ from reffusion.types import Camera, Gaussians
 
 SUPPORT = 0.1  # px, total blending weight in all training views above which a Gaussian is supported and stays
 LONGEST = 256  # px, larger side at which training views are rendered
-BLOCK = 16  # px, side of the blocks of a training view whose mean colours determine the colours of the backdrop
-DISKS = 2000  # number of Gaussians of the sphere: neighbours are 4.5 degrees apart
-SPACING = math.sqrt(4 * math.pi / DISKS)  # radians between neighbouring disks
+BLOCK = 16  # px, side of the blocks of a training view whose mean colors determine the colors of the backdrop
+DISKS = 2000  # number of Gaussians of the sphere: neighbors are 4.5 degrees apart
+SPACING = math.sqrt(4 * math.pi / DISKS)  # radians between neighboring disks
 # Radius of the sphere, divided by the distance of the farthest Gaussian or camera from the middle of the cameras. On a
 # smaller sphere, disks at the edge of a training view would lie in front of Gaussians that they must lie behind.
 CLEARANCE = 1.5
 VIEW_BLUR = 0.06  # radians, `Patches.blur` of a block of a view
-POINT_BLUR = 0.2  # radians, `Patches.blur` of a point that no view shows: one stray point must not colour a whole area
+POINT_BLUR = 0.2  # radians, `Patches.blur` of a point that no view shows: one stray point must not color a whole area
 
 
 class Patches(NamedTuple):
-    """S coloured patches of the scene, each given by the ray along which it is seen; float64.
+    """S colored patches of the scene, each given by the ray along which it is seen; float64.
 
     Attributes:
         origins: [S, 3], where the rays start, in world coordinates.
         directions: [S, 3], directions of the rays, of any length.
         colors: [S, 3] in [0, 1].
-        blur: [S], radius in radians around the ray. When colours are averaged, the weight of the patch is about
+        blur: [S], radius in radians around the ray. When colors are averaged, the weight of the patch is about
             constant within this radius, and decreases with the sixth power of the distance beyond.
     """
 
@@ -103,7 +103,7 @@ def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Se
 def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
     """Render the views, and return their blocks of `BLOCK` x `BLOCK` pixels as patches.
 
-    The colour of a patch is the block's mean colour, divided by its mean alpha. Blocks with a mean alpha up to 0.5 are
+    The color of a patch is the block's mean color, divided by its mean alpha. Blocks with a mean alpha up to 0.5 are
     left out.
     """
     renders = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
@@ -111,12 +111,12 @@ def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches
 
 
 def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """Return the Gaussians whose centres project into the image of no view as patches, seen from the cameras' middle.
+    """Return the Gaussians whose centers project into the image of no view as patches, seen from the cameras' middle.
 
-    These Gaussians come from the scene's sparse points, whose colours are those of photographs that are not among the
-    training views. They look like blobs when rendered, because no training view supervised them, but their colours are
+    These Gaussians come from the scene's sparse points, whose colors are those of photographs that are not among the
+    training views. They look like blobs when rendered, because no training view supervised them, but their colors are
     correct. Unsupported Gaussians that project into a view are left out: they lie behind or inside a surface, and their
-    colours are arbitrary.
+    colors are arbitrary.
 
     Args:
         gaussians: the unsupported Gaussians (see `complete_scene`).
@@ -152,12 +152,12 @@ def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
 def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patches: Patches) -> Gaussians:
     """Return the backdrop: `DISKS` soft disks on a sphere around all Gaussians and cameras, float32 on the CPU.
 
-    The colour of a disk is the weighted mean of the patches' colours. The weight of a patch is larger the nearer to the
+    The color of a disk is the weighted mean of the patches' colors. The weight of a patch is larger the nearer to the
     disk the patch's ray meets the sphere.
 
     Args:
         scenes: the Gaussians that lie inside the sphere. The first scene sets the number of spherical harmonics.
-        cameras: the cameras that lie inside the sphere. Its centre is the mean of their centres.
+        cameras: the cameras that lie inside the sphere. Its center is the mean of their centers.
     """
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
@@ -195,7 +195,7 @@ def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.nd
 
 
 def _interpolate_colors(disks: np.ndarray, hits: np.ndarray, colors: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Return the disks' colours [D, 3]; `disks` and `hits` (where patches' rays meet the sphere) are unit vectors."""
+    """Return the disks' colors [D, 3]; `disks` and `hits` (where patches' rays meet the sphere) are unit vectors."""
     mixed = np.empty_like(disks)
     for part in np.array_split(np.arange(len(disks)), 10):  # all at once would take gigabytes
         squared_distance = 2 - 2 * disks[part] @ hits.T

@@ -34,7 +34,7 @@ class MirrorImage:
         plausible_depth: [H, W] float64, equal to `depth` where photographs show the part of the thing that is mirrored
             and the views do not see past the mirror image (`Visibility.is_empty`); inf elsewhere.
         is_observed: bool [H, W], True where photographs show the part of the thing that is mirrored, so that `picture`
-            has reliable colours.
+            has reliable colors.
         picture: [H, W, 3] uint8, the mirror image.
     """
 

@@ -40,7 +40,7 @@ NEAR = 1.5  # in cells: a mirror image within this distance of a cell of the thi
 MIN_AGREEMENT = 0.93  # of the images that lie on the thing or in free space, least share that lie on the thing
 MIN_OVERLAP = 0.3  # least share of a thing's cells whose mirror images lie on the thing, away from the mirror
 FREE_COST = 3.0  # cost of an image in free space, relative to the gain of an image on the thing
-COLOR_RATIO = 0.8  # images agree in colour if they differ by less than this many times what random places differ by
+COLOR_RATIO = 0.8  # images agree in color if they differ by less than this many times what random places differ by
 MIN_GAIN = 0.02  # least share of a thing's cells whose mirror images lie where no photograph shows anything
 MAX_MIRRORS = 3  # largest number of mirrors of a thing
 
@@ -56,8 +56,8 @@ def find_mirrors(
     """Find the upright mirrors of the things that stand on the largest plane around the removed object.
 
     Things that may continue beyond the search region are left out. A mirror is accepted if the mirror image of the
-    thing's visible part overlaps the thing and lies otherwise where no view looks, hardly in free space; if the colours
-    of the mirror image agree with the thing's colours; and if the mirror image shows something behind the removed
+    thing's visible part overlaps the thing and lies otherwise where no view looks, hardly in free space; if the colors
+    of the mirror image agree with the thing's colors; and if the mirror image shows something behind the removed
     object that no photograph shows.
 
     Args:
@@ -89,7 +89,7 @@ def find_mirrors(
 
 
 def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gaussians:
-    """Replace the harmonics of each Gaussian by its mean colour in the views that show it (degree 0)."""
+    """Replace the harmonics of each Gaussian by its mean color in the views that show it (degree 0)."""
     means = gaussians.means.double().cpu().numpy()
     total, count = torch.zeros_like(gaussians.means), torch.zeros_like(gaussians.means[:, :1])
     # A mirror image shows a Gaussian from directions without a photograph, where its harmonics are arbitrary.
@@ -207,7 +207,7 @@ def _search_mirrors(
         overlap, free = overlap_and_free(*mirror)
         return FREE_COST * free - overlap
 
-    # grid search over angles and offsets, refined by Nelder-Mead; colours are not compared
+    # grid search over angles and offsets, refined by Nelder-Mead; colors are not compared
     grid = []
     for angle in np.linspace(0, np.pi, ANGLES, endpoint=False):
         low, high = np.percentile(points @ normal_at(angle), [10, 90])
@@ -225,7 +225,7 @@ def _search_mirrors(
 def _with_matching_colors(
     points: np.ndarray, mirrors: Sequence[tuple[np.ndarray, float]], cell: float, colors: np.ndarray
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the mirrors whose images have about the colours of the cells of the thing on which they lie."""
+    """Return the mirrors whose images have about the colors of the cells of the thing on which they lie."""
     tree, shuffled, found = cKDTree(points), np.random.default_rng(0).permutation(len(points)), []
     for normal, offset in mirrors:
         moved = np.abs(points @ normal - offset) > NEAR * cell
@@ -242,7 +242,7 @@ def _with_matching_colors(
 
 
 def _mean_colors(points: np.ndarray, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return [P, 3], the mean colours, 0 to 255, of the points in the views that show them; 0 if no view does."""
+    """Return [P, 3], the mean colors, 0 to 255, of the points in the views that show them; 0 if no view does."""
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for view in views[:: max(1, len(views) // VIEWS)]:
         seen = is_seen(view, points)

@@ -124,7 +124,7 @@ def _undistortion(lens: Lens) -> tuple[Lens, np.ndarray | None]:
 
 
 def _distortion_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """Return undistorted coordinates, float32 [H, W, 2], as OpenCV's: (0, 0) is the centre of the first pixel."""
+    """Return undistorted coordinates, float32 [H, W, 2], as OpenCV's: (0, 0) is the center of the first pixel."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     directions = to_directions(np.stack([columns, rows], -1), lens)
     return (directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy) - 0.5).astype(np.float32)

@@ -31,7 +31,7 @@ def depth_ranges(
     - If there are LLFF bounds: near and far as given. The typical depth is their mean in disparity.
     - From all cameras: the typical depth is the depth of the point nearest to all optical axes. If these are parallel
       or meet behind the cameras, the typical depth is three times the spread of the cameras (root mean square distance
-      of their centres from the mean centre). Near and far are a third of the typical depth and four times as much.
+      of their centers from the mean center). Near and far are a third of the typical depth and four times as much.
     - If all cameras are at one place: the median over the views that have enough points.
 
     Args:
@@ -88,7 +88,7 @@ def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
-    """Return the camera centres [V, 3] of world-to-camera poses [V, 4, 4]."""
+    """Return the camera centers [V, 3] of world-to-camera poses [V, 4, 4]."""
     return -np.einsum("vji,vj->vi", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
 
 
@@ -182,7 +182,7 @@ def add_random_points(
 ) -> Scene:
     """Return the scene with `count` more points, drawn at random in the views' frusta (`sample_frustum_points`).
 
-    Each point has the colour of the pixel for which it was drawn.
+    Each point has the color of the pixel for which it was drawn.
 
     Args:
         ranges: [V, 3] near, typical and far depth of each view in `scene.cameras`, in the normalised frame.

@@ -62,7 +62,7 @@ def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
 def supported_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
     """Return the highest degree of spherical harmonics that the number of views supports, at most `most`.
 
-    A degree has (degree + 1)^2 coefficients per colour. The degree is supported if at least that many views contain a
+    A degree has (degree + 1)^2 coefficients per color. The degree is supported if at least that many views contain a
     typical point (`typical_view_count`).
 
     Args:

@@ -1,7 +1,7 @@
 """Lenses: distortion models, and undistortion, which replaces a distorted lens by a pinhole.
 
 A *direction* is [..., 2], the camera coordinates (x/z, y/z) of a ray, with x right and y down. Pixel coordinates are as
-in docs/architecture.md: the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
+in docs/architecture.md: the center of pixel (column i, row j) is (i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def distort(directions: np.ndarray, lens: Lens) -> np.ndarray:
     square = angle * angle
     factor = _polynomial(lens.radial, square) / _polynomial(lens.denominator, square)
     if lens.fisheye:
-        # atan(l) / l, 1 at the centre
+        # atan(l) / l, 1 at the center
         return xy * factor * np.divide(angle, length, out=np.ones_like(length), where=length > 1e-12)
     (p1, p2), x, y = lens.tangential, xy[..., :1], xy[..., 1:]
     tangential = np.concatenate(
@@ -253,7 +253,7 @@ def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
     """
     import cv2
 
-    at = (where - 0.5).astype(np.float32)  # OpenCV counts from the centre of the first pixel
+    at = (where - 0.5).astype(np.float32)  # OpenCV counts from the center of the first pixel
     return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
 
 

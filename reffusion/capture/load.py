@@ -2,7 +2,7 @@
 photographs only.
 
 Every layout is read into a `Capture`: pictures by view name and, if the folder holds poses, lenses and poses in the
-scene's own frame. Of pictures only headers are read, except for a few, whose colours are compared with the colours of
+scene's own frame. Of pictures only headers are read, except for a few, whose colors are compared with the colors of
 the sparse points, and pictures twice as wide as high.
 """
 

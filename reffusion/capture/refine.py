@@ -2,7 +2,7 @@
 
 Poses that come with a capture were solved with one lens for all views. But a phone's stabiliser shifts the lens from
 shot to shot. Then no pose fits near and distant objects at once: distant objects are off by a pixel or two, and no
-Gaussian is sharp in all views. Optical flow between neighbouring views shows such errors everywhere in the picture. The
+Gaussian is sharp in all views. Optical flow between neighboring views shows such errors everywhere in the picture. The
 pose and the principal point of each view are then adjusted to the flow by bundle adjustment (Ceres, through COLMAP).
 Focal lengths stay fixed. If they are adjusted too, they drift in captures whose views share little (`fox`: by half),
 and gain almost nothing elsewhere (`statue`: 0.097 -> 0.091 px).
@@ -113,12 +113,12 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
     """Return the systematic reprojection error of cameras in pixels; NaN if there are too few matches.
 
     Points are triangulated from the flow. A residual vector leads from the place where flow finds a point in a
-    neighbouring view to the point's projection. For each block of a picture and each neighbour, the median of the
+    neighboring view to the point's projection. For each block of a picture and each neighbor, the median of the
     residual vectors is taken. The result is the mean length of these medians. The noise of flow has no preferred
     direction, so that the median leaves the error of the cameras.
 
     Args:
-        matches: matches of each view with its neighbours.
+        matches: matches of each view with its neighbors.
         cameras: view name -> camera.
         cell: side in pixels of the cells in which the matches were made; a block has `BLOCK` x `BLOCK` cells.
     """
@@ -136,7 +136,7 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
 
 
 def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):
-    """Return `sightings` and `points` of `bundle_adjust`: one point per matched pixel that agrees with a neighbour."""
+    """Return `sightings` and `points` of `bundle_adjust`: one point per matched pixel that agrees with a neighbor."""
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:

@@ -1,4 +1,4 @@
-"""Dense matches between views: optical flow to neighbouring views, and points triangulated from this flow.
+"""Dense matches between views: optical flow to neighboring views, and points triangulated from this flow.
 
 The sparse points of structure from motion come from distinctive corners, which are rare in foliage, on distant facades
 and in the sky. In such areas 3DGS would have to grow Gaussians from distant Gaussians, and a short run has too few
@@ -21,7 +21,7 @@ import torch
 
 from reffusion.types import Camera
 
-NEIGHBOURS = 4  # number of views with which each view is matched
+NEIGHBORS = 4  # number of views with which each view is matched
 TURN = np.cos(np.radians(40))  # cosine of 40 degrees: views whose axes differ by more are not matched
 ROUND_TRIP = 1.5  # px: largest distance between a pixel and the end of forward flow followed by backward flow
 RESIDUAL = 1.5  # px: largest reprojection error of a point against the flow
@@ -30,19 +30,19 @@ LEAST_CONTRAST = 0.7  # levels of 255: standard deviation in a window of 9 px, b
 # standard deviations that follow from it, so that it would lie behind the camera.
 NOISE = 0.3
 FARTHEST = 20.0  # units of the normalised frame: points farther away, as in the sky, are moved to this depth
-ZOOM = 1.1  # ratio of focal lengths from which a neighbour's picture is resampled to this view's focal length
+ZOOM = 1.1  # ratio of focal lengths from which a neighbor's picture is resampled to this view's focal length
 SAME_DEPTH = 0.1  # relative difference of depth, below which a new point lies on the surface of an existing one
 
 
 @dataclass(frozen=True)
 class Matches:
-    """The pixels of a view, and the pixels in its neighbours that show the same points, by optical flow.
+    """The pixels of a view, and the pixels in its neighbors that show the same points, by optical flow.
 
     Attributes:
         view: name of the view.
         pixels: [P, 2] float64, coordinates (x, y) of pixels in the view.
-        others: names of the K neighbours.
-        places: [K, P, 2], coordinates (x, y) of the matching pixels in the neighbours.
+        others: names of the K neighbors.
+        places: [K, P, 2], coordinates (x, y) of the matching pixels in the neighbors.
         seen: [K, P] bool, True if the match is valid: forward and backward flow agree, and the pixel has contrast.
             `places` is meaningless elsewhere.
     """
@@ -68,7 +68,7 @@ def triangulate_points(
         cell: side of a cell in pixels, at least 1.
 
     Returns:
-        The points [P, 3] float64 and their colours [P, 3] uint8. A colour is the mean over a square of the cell's size.
+        The points [P, 3] float64 and their colors [P, 3] uint8. A color is the mean over a square of the cell's size.
     """
     by_name = {camera.name: camera for camera in cameras}
     points, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
@@ -90,15 +90,15 @@ def triangulate_points(
 def match_views(
     chosen: Sequence[Camera], cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
 ) -> Iterator[Matches]:
-    """Yield the matches of each of the `chosen` views with its neighbours among `cameras`, one pixel per cell.
+    """Yield the matches of each of the `chosen` views with its neighbors among `cameras`, one pixel per cell.
 
     Args:
         images: view name -> uint8 [H, W, 3], for all `cameras`.
         cell: side of a cell in pixels.
     """
     gray = {camera.name: cv2.cvtColor(images[camera.name], cv2.COLOR_RGB2GRAY) for camera in cameras}
-    neighbours_of = {camera.name: tuple(other.name for other in find_neighbours(camera, cameras)) for camera in chosen}
-    pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in neighbours_of for other in neighbours_of[name]))
+    neighbors_of = {camera.name: tuple(other.name for other in find_neighbors(camera, cameras)) for camera in chosen}
+    pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in neighbors_of for other in neighbors_of[name]))
     found = {}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         by_name = {camera.name: camera for camera in cameras}
@@ -108,23 +108,23 @@ def match_views(
             found[one, other], found[other, one] = forward, back
     for camera in chosen:
         pixels = _pixels(gray[camera.name], cell).reshape(-1, 2)
-        places, seen = np.empty((len(neighbours_of[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
+        places, seen = np.empty((len(neighbors_of[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
         if len(places):
             places, seen = map(
-                np.stack, zip(*(found[camera.name, other] for other in neighbours_of[camera.name]), strict=True)
+                np.stack, zip(*(found[camera.name, other] for other in neighbors_of[camera.name]), strict=True)
             )
-        yield Matches(camera.name, pixels, neighbours_of[camera.name], places, seen)
+        yield Matches(camera.name, pixels, neighbors_of[camera.name], places, seen)
 
 
-def find_neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
+def find_neighbors(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
     """Return the cameras at other places whose axes are within 40 degrees (`TURN`) of that of `camera`.
 
-    These are the nearest ones, at most `NEIGHBOURS`, sorted by distance.
+    These are the nearest ones, at most `NEIGHBORS`, sorted by distance.
     """
     away = {other.name: float(np.linalg.norm(other.center - camera.center)) for other in cameras}
     axis = camera.world_to_camera[2, :3]
     others = [o for o in cameras if away[o.name] > 1e-6 and o.world_to_camera[2, :3] @ axis > TURN]
-    return sorted(others, key=lambda other: away[other.name])[:NEIGHBOURS]
+    return sorted(others, key=lambda other: away[other.name])[:NEIGHBORS]
 
 
 def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
@@ -136,7 +136,7 @@ def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
 def _flow_both_ways(
     one: tuple[Camera, np.ndarray], other: tuple[Camera, np.ndarray], cell: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Match the pixels of two views (camera, grey picture) both ways; return `_follow_flow` for each view."""
+    """Match the pixels of two views (camera, gray picture) both ways; return `_follow_flow` for each view."""
     if not _has_same_scale(one[0], other[0]):
         return [_follow_resampled(*one, *other, cell), _follow_resampled(*other, *one, cell)]
     forward, back = _flow(one[1], other[1]), _flow(other[1], one[1])
@@ -144,7 +144,7 @@ def _flow_both_ways(
 
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the optical flow [H, W, 2] from one grey picture, uint8 [H, W], to another of the same size."""
+    """Return the optical flow [H, W, 2] from one gray picture, uint8 [H, W], to another of the same size."""
     return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(one, other, None)
 
 
@@ -157,9 +157,9 @@ def _has_same_scale(one: Camera, other: Camera) -> bool:
 def _follow_resampled(
     camera: Camera, gray: np.ndarray, other: Camera, picture: np.ndarray, cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `_follow_flow` to a neighbour, `other` and `picture`, of another picture size or focal length."""
+    """Return `_follow_flow` to a neighbor, `other` and `picture`, of another picture size or focal length."""
     scale = np.array([camera.fx / other.fx, camera.fy / other.fy])
-    # pixel coordinates as in docs/architecture.md; OpenCV counts from the centre of the first pixel
+    # pixel coordinates as in docs/architecture.md; OpenCV counts from the center of the first pixel
     shift = np.array([camera.cx, camera.cy]) - scale * (other.cx, other.cy)
     if scale.min() < 1:
         picture = cv2.GaussianBlur(picture, (0, 0), 0.5 / scale.min())
@@ -186,7 +186,7 @@ def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: 
 
 
 def _local_contrast(gray: np.ndarray) -> np.ndarray:
-    """Return [H, W], the standard deviation of grey levels in a window of 9 x 9 pixels around each pixel."""
+    """Return [H, W], the standard deviation of gray levels in a window of 9 x 9 pixels around each pixel."""
     wide = gray.astype(np.float32)
     return np.sqrt(np.maximum(cv2.blur(wide**2, (9, 9)) - cv2.blur(wide, (9, 9)) ** 2, 0))
 
@@ -195,20 +195,20 @@ def _local_contrast(gray: np.ndarray) -> np.ndarray:
 
 
 def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the depths of a view's pixels from their matches in neighbouring views.
+    """Compute the depths of a view's pixels from their matches in neighboring views.
 
-    Let R and t be the rotation and translation from this view to a neighbour, and let a pixel's ray have z = 1. The
-    point of inverse depth r on the ray is R ray + r t in the neighbour, up to scale. Its reprojection error times its
-    depth in the neighbour is linear in r. So each neighbour proposes an r. The proposal with which most neighbours
-    agree (reprojection error in x and in y below `RESIDUAL` px) is refined by least squares over the neighbours that
+    Let R and t be the rotation and translation from this view to a neighbor, and let a pixel's ray have z = 1. The
+    point of inverse depth r on the ray is R ray + r t in the neighbor, up to scale. Its reprojection error times its
+    depth in the neighbor is linear in r. So each neighbor proposes an r. The proposal with which most neighbors
+    agree (reprojection error in x and in y below `RESIDUAL` px) is refined by least squares over the neighbors that
     agree.
 
     Args:
-        cameras: view name -> camera, of the view and its neighbours.
+        cameras: view name -> camera, of the view and its neighbors.
 
     Returns:
         Depth [P], very large if there is no parallax; and bool [P], True if the depth is reliable. It is reliable if
-        at least two neighbours agree (one, if there is only one), and if the point is not clearly behind the camera.
+        at least two neighbors agree (one, if there is only one), and if the point is not clearly behind the camera.
     """
     count = len(matches.pixels)
     if not matches.others:
@@ -222,7 +222,7 @@ def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.nda
     for _ in range(2):
         agree = [_agrees(line, inverse) & seen for line, seen in zip(lines, matches.seen, strict=True)]
         weights = [
-            a / np.maximum(_neighbour_depth(line, inverse), 1e-3) ** 2 for line, a in zip(lines, agree, strict=True)
+            a / np.maximum(_neighbor_depth(line, inverse), 1e-3) ** 2 for line, a in zip(lines, agree, strict=True)
         ]
         inverse, square = _solve_inverse_depth(lines, weights)
     known = (np.sum(agree, 0) >= min(2, len(lines))) & (inverse > -2 * NOISE / np.sqrt(square))
@@ -230,27 +230,27 @@ def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.nda
 
 
 def flow_residuals(matches: Matches, cameras: Mapping[str, Camera], depth: np.ndarray) -> np.ndarray:
-    """Return the residual vectors [K, P, 2] in pixels of a view's points in its K neighbours.
+    """Return the residual vectors [K, P, 2] in pixels of a view's points in its K neighbors.
 
-    A vector leads from the pixel that flow found in the neighbour to the projection of the point there, also where the
-    match is not valid (`Matches.seen`). It is NaN if the point is behind the neighbour.
+    A vector leads from the pixel that flow found in the neighbor to the projection of the point there, also where the
+    match is not valid (`Matches.seen`). It is NaN if the point is behind the neighbor.
 
     Args:
         depth: [P], depths of the pixels of `matches`; the points lie there on their rays.
     """
     found = []
     for line in _reprojection_lines(matches, cameras):
-        z = _neighbour_depth(line, 1 / depth)
+        z = _neighbor_depth(line, 1 / depth)
         z = np.where(z > 1e-3, z, np.nan)
         found.append((line.slope / depth[:, None] + line.offset) / z[:, None])
     return np.array(found).reshape(len(matches.others), len(depth), 2)
 
 
 class _ReprojectionLine(NamedTuple):
-    """The residuals in one neighbour of P points on the rays of a view's pixels, as functions of inverse depth.
+    """The residuals in one neighbor of P points on the rays of a view's pixels, as functions of inverse depth.
 
     At inverse depth r the residual vector, in pixels, is (slope r + offset) / (z + shift r). The denominator is the
-    point's depth in the neighbour over its depth in the view.
+    point's depth in the neighbor over its depth in the view.
     """
 
     slope: np.ndarray  # [P, 2]
@@ -260,7 +260,7 @@ class _ReprojectionLine(NamedTuple):
 
 
 def _reprojection_lines(matches: Matches, cameras: Mapping[str, Camera]) -> list[_ReprojectionLine]:
-    """Return the residuals of the matched pixels in each neighbour as functions of inverse depth."""
+    """Return the residuals of the matched pixels in each neighbor as functions of inverse depth."""
     camera, lines = cameras[matches.view], []
     ray = _rays(camera, matches.pixels)
     for name, place in zip(matches.others, matches.places, strict=True):
@@ -274,21 +274,21 @@ def _reprojection_lines(matches: Matches, cameras: Mapping[str, Camera]) -> list
     return lines
 
 
-def _neighbour_depth(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
-    """Return [P], each point's depth in the neighbour over its depth in this view, at inverse depths [P]."""
+def _neighbor_depth(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
+    """Return [P], each point's depth in the neighbor over its depth in this view, at inverse depths [P]."""
     return line.z + line.shift * inverse
 
 
 def _agrees(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
-    """Return whether each point is in front of the neighbour and within `RESIDUAL` px of its match in x and y, [P]."""
-    z = _neighbour_depth(line, inverse)
+    """Return whether each point is in front of the neighbor and within `RESIDUAL` px of its match in x and y, [P]."""
+    z = _neighbor_depth(line, inverse)
     miss_x, miss_y = np.abs(line.slope * inverse[:, None] + line.offset).T  # numpy is slow to reduce an axis of 2
     return (z > 1e-3) & (np.maximum(miss_x, miss_y) < RESIDUAL * z)
 
 
 def _solve_inverse_depth(lines: Sequence[_ReprojectionLine], weights: Sequence) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares inverse depths [P], and the denominator [P], the weighted sum of squared slopes."""
-    # If each weight is one over the squared depth in the neighbour, the variance of the inverse depth is the variance
+    # If each weight is one over the squared depth in the neighbor, the variance of the inverse depth is the variance
     # of flow in px^2 divided by this denominator.
     square = sum(_dot(line.slope, line.slope) * weight for line, weight in zip(lines, weights, strict=True))
     square = np.maximum(square, 1e-12)

@@ -1,7 +1,7 @@
 """Propagation of the object's masks from a few views to all views, without a segmentation network.
 
 The masks vote on the Gaussians: the vote of a mask is the blending weight of a Gaussian, summed over the pixels inside
-the mask (for the object) or outside the mask (against the object). A minimum cut between neighbouring Gaussians labels
+the mask (for the object) or outside the mask (against the object). A minimum cut between neighboring Gaussians labels
 the Gaussians that have no votes. In each view the silhouette of the labelled Gaussians is moved to the edges of the
 photograph.
 """
@@ -18,7 +18,7 @@ from reffusion.clicks import color_evidence
 from reffusion.clicks.geodesic_cut import keep_connected, relative_distance
 from reffusion.clicks.marks import UNKNOWN
 from reffusion.clicks.mask_borders import erode, refine_edges
-from reffusion.gaussians.neighbours import NeighbourGraph
+from reffusion.gaussians.neighbors import NeighborGraph
 from reffusion.graph_cut import min_cut
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
@@ -27,13 +27,13 @@ from reffusion.types import Camera, Gaussians
 LARGEST_VOTE = 5.0  # px, upper limit of the votes for one Gaussian (blending weight summed over pixels)
 LEAST_VOTE = 1.0  # px of blending weight that votes must exceed to determine the label of a Gaussian
 RIM = 0.006  # share of the larger image side: pixels this near to a mask's border do not vote
-RING = 0.05  # share of the larger image side: width of the ring around a mask in which `is_visible` compares colours
-# A photograph does not show the object if the colour difference (1 = white against black) between photograph and
+RING = 0.05  # share of the larger image side: width of the ring around a mask in which `is_visible` compares colors
+# A photograph does not show the object if the color difference (1 = white against black) between photograph and
 # rendering inside the mask is at least ABSENT times the difference in the ring, plus LEVEL.
 ABSENT, LEVEL = 3.0, 0.02
-ROUNDS = 3  # largest number of cuts; each takes the object's colours from the labels of the cut before
+ROUNDS = 3  # largest number of cuts; each takes the object's colors from the labels of the cut before
 COLOR = 1.0  # votes per px of blending weight that a Gaussian has in the mean of the views without masks
-NEARER = 3.0  # weight of the relative distance to object and background, where the log ratio of colours has weight 1
+NEARER = 3.0  # weight of the relative distance to object and background, where the log ratio of colors has weight 1
 COVERED = 0.5  # rendered label (1 = object) above which a pixel shows the object
 
 
@@ -52,7 +52,7 @@ def surface_relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def label_gaussians(
     gaussians: Gaussians,
-    near: NeighbourGraph,
+    near: NeighborGraph,
     cameras: Mapping[str, Camera],
     masks: Mapping[str, np.ndarray],
     image_of: Callable[[str], np.ndarray],
@@ -60,14 +60,14 @@ def label_gaussians(
 ) -> Tensor:
     """Return bool [N], True = the Gaussian belongs to the object.
 
-    Votes of the masks label the Gaussians that the views with masks show. Gaussians whose centres project beside a mask
+    Votes of the masks label the Gaussians that the views with masks show. Gaussians whose centers project beside a mask
     count as background, unless the masks vote for them. A minimum cut labels all other Gaussians. The cut uses the
-    distances to labelled Gaussians, the colours of the photographs without masks, and the similarity of neighbours. The
-    result contains only Gaussians that a chain of object neighbours connects with a Gaussian that votes label as the
+    distances to labelled Gaussians, the colors of the photographs without masks, and the similarity of neighbors. The
+    result contains only Gaussians that a chain of object neighbors connects with a Gaussian that votes label as the
     object.
 
     Args:
-        near: the graph of neighbouring Gaussians, from `find_neighbours`.
+        near: the graph of neighboring Gaussians, from `find_neighbors`.
         cameras: view -> Camera, all views.
         masks: view -> bool [H, W], True = the object; at least one view.
         image_of: view -> photograph, uint8 [H, W, 3].
@@ -121,7 +121,7 @@ def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np
     """Return True if a photograph shows the object inside its mask, False if the photograph was taken without it.
 
     The photograph is compared with the rendering of the Gaussians, which contain the object. The object is visible if
-    the mean colour difference inside the mask is not much larger than in a ring around the mask.
+    the mean color difference inside the mask is not much larger than in a ring around the mask.
 
     Args:
         image: uint8 [H, W, 3], the photograph.

@@ -1,8 +1,8 @@
-"""Colours as evidence for the labels of Gaussians that the views with masks do not see.
+"""Colors as evidence for the labels of Gaussians that the views with masks do not see.
 
 A view with a mask shows nothing of the object's far side. The labels of Gaussians on the far side are unknown: they may
 be the object's back or top, or the background behind the object. In each photograph without a mask the pixels of
-Gaussians with known labels give the colours of object and background. These colours are compared with the colours at
+Gaussians with known labels give the colors of object and background. These colors are compared with the colors at
 the unknown Gaussians.
 """
 
@@ -23,8 +23,8 @@ from reffusion.types import Camera, Gaussians
 
 LONGEST = 256  # px, the larger side at which photographs are compared
 VIEWS = 24  # largest number of photographs that are compared
-LEAST_COVERAGE = 0.6  # blending weight that Gaussians of one label must exceed at a pixel for its colour to count
-RING = 0.12  # share of the larger side: how far around the object background colours are collected
+LEAST_COVERAGE = 0.6  # blending weight that Gaussians of one label must exceed at a pixel for its color to count
+RING = 0.12  # share of the larger side: how far around the object background colors are collected
 FRONT_PERCENTILE = 5  # percentile of the depths in a mask that is taken as the depth of the object's front
 OCCLUDER_DEPTH = 0.98  # share of the front's depth: a surface nearer than this may hide the object
 LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of likelihoods
@@ -46,7 +46,7 @@ class KnownLabels:
 def find_outside(
     gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], margin: int
 ) -> np.ndarray:
-    """Return bool [N], True = the Gaussian's centre projects beside the mask in at least one view, at any depth.
+    """Return bool [N], True = the Gaussian's center projects beside the mask in at least one view, at any depth.
 
     Such a Gaussian cannot be part of the object, because a mask covers the whole visible object. Pixels whose rendered
     depth is nearer than the object's front are not used: the surface there may hide a part of the object. Views in
@@ -73,12 +73,12 @@ def find_outside(
 def color_votes(
     gaussians: Gaussians, known: KnownLabels, cameras: Mapping[str, Camera], image_of: Callable[[str], np.ndarray]
 ) -> np.ndarray:
-    """Return float [N, 2]: for each Gaussian how much its colours resemble the object, and how well views show it.
+    """Return float [N, 2]: for each Gaussian how much its colors resemble the object, and how well views show it.
 
     Up to `VIEWS` views, evenly spaced in the order of their names, are compared at a larger side of at most `LONGEST`.
 
     Args:
-        known: the Gaussians whose pixels give the colours of object and background.
+        known: the Gaussians whose pixels give the colors of object and background.
         cameras: view -> Camera, the views without masks.
         image_of: view -> photograph, uint8 [H, W, 3].
 
@@ -107,7 +107,7 @@ def color_votes(
 
 
 def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray | None:
-    """Return float [H, W]: the natural logarithm of the ratio of two frequencies of each pixel's colour, that among the
+    """Return float [H, W]: the natural logarithm of the ratio of two frequencies of each pixel's color, that among the
     object's pixels to that among the pixels around the object.
 
     Args:

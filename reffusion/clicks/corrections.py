@@ -58,7 +58,7 @@ def apply_box(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) -> 
     """Return bool [H, W], the mask `before` with the thing inside the last mark, a box, added or removed.
 
     The network proposes things. If the box has no size, the thing is taken that the network is surest of, and whose own
-    bounding box is most like the box. Without a network, colours separate the thing from what surrounds the box.
+    bounding box is most like the box. Without a network, colors separate the thing from what surrounds the box.
 
     Args:
         marks: all marks of the view so far. Pixels that they confirm to be the opposite do not change.
@@ -143,7 +143,7 @@ def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
 
 
 def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
-    """Return the mask, corrected around clicks that contradict it, up to changes of colour and edges of the relief."""
+    """Return the mask, corrected around clicks that contradict it, up to changes of color and edges of the relief."""
     lab, small, marks = downscale(view.image, clicks)
     before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
     grid = pixel_pairs(small)

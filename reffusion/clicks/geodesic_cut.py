@@ -1,6 +1,6 @@
 """Segmentation of a graph by geodesic distances (lengths of shortest paths) and minimum cuts.
 
-The N nodes of the graph are the pixels of a picture, or Gaussians. Its E pairs are neighbours.
+The N nodes of the graph are the pixels of a picture, or Gaussians. Its E pairs are neighbors.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from scipy.sparse import csgraph
 from reffusion.clicks.marks import OBJECT, OTHER
 from reffusion.graph_cut import HARD, min_cut
 
-BINS = 20  # bins of a colour histogram along each axis of 8-bit L*a*b*
-ROUNDS = 3  # rounds of `grow_object`; each takes its colour models from the labels of the round before
+BINS = 20  # bins of a color histogram along each axis of 8-bit L*a*b*
+ROUNDS = 3  # rounds of `grow_object`; each takes its color models from the labels of the round before
 # Cost of a path from the second round on: per unit of `color_steps`, and per unit of change in the probability [0, 1]
-# that a colour is the object's.
+# that a color is the object's.
 COLOR_COST, LIKELIHOOD_COST = 0.3, 100.0
-# Where depth is known: weight of a colour difference within a surface, and cost of an edge between surfaces.
+# Where depth is known: weight of a color difference within a surface, and cost of an edge between surfaces.
 COLOR_ON_SURFACE, DEPTH_EDGE_COST = 0.35, 60.0
-SMOOTH = 5.0  # cost of a border between two neighbours of the same colour
+SMOOTH = 5.0  # cost of a border between two neighbors of the same color
 # A candidate contains the nodes that lie within this share of the path from a click to the background.
 REACHES = 0.5, 0.44, 0.37, 0.3
 # Path cost (units of 8-bit L*a*b* plus pixels) over which the influence of a correcting click falls to 1/e.
 CORRECTION_REACH = 150.0
-EDGE_CONTRAST = 10.0  # colour difference in 8-bit L*a*b* that counts as a full edge of an object
+EDGE_CONTRAST = 10.0  # color difference in 8-bit L*a*b* that counts as a full edge of an object
 SIZE_PENALTY = 0.05  # subtracted from the score per natural logarithm of the object's size
-LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of colour frequencies
+LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of color frequencies
 
 
 def grow_object(
@@ -40,18 +40,18 @@ def grow_object(
     """Return bool [N], True = the object, grown from a few seeds by geodesic graph cuts.
 
     Each of `ROUNDS` rounds measures the geodesic distances of all nodes to the object's seeds and to the other seeds,
-    estimates the colours of object and background from the labels of the round before (from the distances in the first
+    estimates the colors of object and background from the labels of the round before (from the distances in the first
     round), and labels all nodes by a minimum cut. The result contains only nodes that are connected with a seed of the
     object.
 
     Args:
-        lab: float [N, 3], colours in L*a*b*, each axis in [0, 255] as in 8-bit pictures.
-        pairs: int [E, 2], neighbours, each pair once.
-        length: [E] > 0, distance of the two neighbours of a pair; 1 for adjacent pixels.
+        lab: float [N, 3], colors in L*a*b*, each axis in [0, 255] as in 8-bit pictures.
+        pairs: int [E, 2], neighbors, each pair once.
+        length: [E] > 0, distance of the two neighbors of a pair; 1 for adjacent pixels.
         seeds: int8 [N], OBJECT, OTHER or UNKNOWN; at least one OBJECT.
         weak: bool [N], True = unlikely to be the object, such as the picture's border. Distances treat these nodes as
             OTHER, but the cut may still label them as object.
-        depth_edges: [E] in [0, 1], 1 where the two neighbours lie on different surfaces; None if depth is unknown.
+        depth_edges: [E] in [0, 1], 1 where the two neighbors lie on different surfaces; None if depth is unknown.
     """
     step = color_steps(lab, pairs, depth_edges)
     smooth = _smoothness(step, length)
@@ -79,7 +79,7 @@ def nested_candidates(
     """Return candidates for the object that clicks mean, bool [N] each, from the largest to the smallest.
 
     There is one candidate for each share in `REACHES`, and each lies within the one before. The cuts use geodesic
-    distances along surfaces and colours, but no colour models.
+    distances along surfaces and colors, but no color models.
 
     Args:
         lab, pairs, length, seeds, weak, depth_edges: as for `grow_object`; `depth_edges` is required.
@@ -118,16 +118,16 @@ def object_score(
 ) -> float:
     """Score how well labels outline one complete object; a higher score is better.
 
-    The score is high if the border follows edges of surfaces or of colours, if no edge of a surface lies inside, and if
-    the colours inside differ from the colours around. A penalty on size prefers the smaller of two equal candidates.
+    The score is high if the border follows edges of surfaces or of colors, if no edge of a surface lies inside, and if
+    the colors inside differ from the colors around. A penalty on size prefers the smaller of two equal candidates.
 
     Args:
         labels: bool [N], True = the object.
-        around: bool [N], True = the surroundings whose colours are compared.
+        around: bool [N], True = the surroundings whose colors are compared.
         lab, pairs, depth_edges: as for `grow_object`; `depth_edges` is required.
 
     Returns:
-        The score, or -inf if the labels contain no two neighbours, have no border, or nothing is around them.
+        The score, or -inf if the labels contain no two neighbors, have no border, or nothing is around them.
     """
     ends = labels[pairs]
     inside, rim = ends.all(1), ends[:, 0] != ends[:, 1]
@@ -140,9 +140,9 @@ def object_score(
 
 
 def color_steps(lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray | None) -> np.ndarray:
-    """Return [E] >= 0, how different the two neighbours of each pair are.
+    """Return [E] >= 0, how different the two neighbors of each pair are.
 
-    This is the colour difference in 8-bit L*a*b* if `depth_edges` is None. Otherwise it is a weighted sum of the colour
+    This is the color difference in 8-bit L*a*b* if `depth_edges` is None. Otherwise it is a weighted sum of the color
     difference and `depth_edges`, in which edges of surfaces dominate.
 
     Args:
@@ -162,7 +162,7 @@ def correct_labels(
 ) -> np.ndarray:
     """Return bool [N]: the labels `before`, changed around the seeds that contradict them.
 
-    The influence of a contradicting seed falls with the geodesic distance, which grows at changes of colour and at
+    The influence of a contradicting seed falls with the geodesic distance, which grows at changes of color and at
     edges of surfaces. A contradicting seed has no influence on nodes that are nearer to a seed which agrees with
     `before`.
 
@@ -188,7 +188,7 @@ def correct_labels(
 
 
 def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the cost [E] of a border between neighbours, low where `step` (`color_steps`) exceeds its usual size."""
+    """Return the cost [E] of a border between neighbors, low where `step` (`color_steps`) exceeds its usual size."""
     usual = float((step**2).sum()) / max(len(step), 1)  # mean square
     return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
 
@@ -198,7 +198,7 @@ def keep_connected(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> 
 
     Args:
         labels: bool [N].
-        pairs: int [E, 2], neighbours.
+        pairs: int [E, 2], neighbors.
         seeds: bool [N].
     """
     kept = pairs[labels[pairs].all(1)]
@@ -214,7 +214,7 @@ def relative_distance(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, 
     -1 at `those`.
 
     Args:
-        pairs: int [E, 2], neighbours.
+        pairs: int [E, 2], neighbors.
         length: [E] > 0, length of each pair.
         these, those: bool [N].
     """
@@ -233,10 +233,10 @@ def _distance(graph: sparse.csr_array, start: np.ndarray) -> np.ndarray:
 
 
 def color_frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return [N] > 0, for each node the relative frequency of its colour among all nodes.
+    """Return [N] > 0, for each node the relative frequency of its color among all nodes.
 
     Args:
-        lab: float [N, 3], colours in 8-bit L*a*b*.
+        lab: float [N, 3], colors in 8-bit L*a*b*.
         weight: [N] >= 0, how much each node counts in the frequencies.
     """
     count = color_histogram(lab, weight)
@@ -244,7 +244,7 @@ def color_frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def color_histogram(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return [BINS, BINS, BINS], a slightly blurred histogram of colours; arguments as for `color_frequency`."""
+    """Return [BINS, BINS, BINS], a slightly blurred histogram of colors; arguments as for `color_frequency`."""
     count = np.zeros((BINS,) * 3)
     np.add.at(count, _bins(lab), weight)
     return ndimage.gaussian_filter(count, 0.7, mode="nearest")

@@ -18,7 +18,7 @@ class Clicks:
     """Clicks on a view in the order in which they were made.
 
     Attributes:
-        points: float64 [K, 2], (x, y) in pixels of the view; the first pixel's centre is (0.5, 0.5).
+        points: float64 [K, 2], (x, y) in pixels of the view; the first pixel's center is (0.5, 0.5).
         positive: bool [K], True = on the object, False = on the background.
     """
 
@@ -109,7 +109,7 @@ def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarra
 
 
 def stroke_pixels(stroke: Mark, shape: tuple[int, int]) -> np.ndarray:
-    """Return bool [H, W], the pixels whose centres lie within the brush's radius of the stroke's path.
+    """Return bool [H, W], the pixels whose centers lie within the brush's radius of the stroke's path.
 
     Args:
         shape: (H, W).

@@ -9,8 +9,8 @@ from reffusion.clicks.marks import OBJECT, OTHER
 from reffusion.morphology import disk
 
 BAND = 0.008  # share of the larger side: how far `refine_edges` may move a mask's border
-LEAST_PIXELS = 10  # least number of pixels for a model of their colours
-MARGIN = 3  # `refine_edges` uses the colours up to this many bands (`BAND`) away from a mask
+LEAST_PIXELS = 10  # least number of pixels for a model of their colors
+MARGIN = 3  # `refine_edges` uses the colors up to this many bands (`BAND`) away from a mask
 
 
 def bounding_box(mask: np.ndarray) -> tuple[float, float, float, float]:
@@ -20,7 +20,7 @@ def bounding_box(mask: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the mask with its border moved to changes of colour by GrabCut.
+    """Return bool [H, W], the mask with its border moved to changes of color by GrabCut.
 
     The border moves by at most the share `BAND` of the larger image side. The mask is returned unchanged if the mask or
     its surroundings have fewer than 10 pixels.
@@ -50,9 +50,9 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
 
 
 def cut_box(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the thing inside a box, found by GrabCut: its colours are rare around the box.
+    """Return bool [H, W], the thing inside a box, found by GrabCut: its colors are rare around the box.
 
-    Colours are compared up to the box's own size away from it. The result is empty if the box has no surroundings.
+    Colors are compared up to the box's own size away from it. The result is empty if the box has no surroundings.
 
     Args:
         image: uint8 [H, W, 3].

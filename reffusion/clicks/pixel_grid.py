@@ -1,4 +1,4 @@
-"""The reduced picture that clicks segment: colours, pairs of neighbouring pixels, edges between surfaces."""
+"""The reduced picture that clicks segment: colors, pairs of neighboring pixels, edges between surfaces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int,
     """Reduce a picture and its clicks to the size for segmentation, at most `LONGEST` px on the larger side.
 
     Returns:
-        Colours float64 [h * w, 3] in 8-bit L*a*b*; (h, w); marks int8 [h, w], OBJECT, OTHER or UNKNOWN.
+        Colors float64 [h * w, 3] in 8-bit L*a*b*; (h, w); marks int8 [h, w], OBJECT, OTHER or UNKNOWN.
     """
     factor = min(1.0, LONGEST / max(image.shape[:2]))
     height, width = (max(1, round(side * factor)) for side in image.shape[:2])
@@ -34,7 +34,7 @@ def upscale(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def pixel_pairs(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs int [E, 2] of neighbouring pixels (8-neighbourhood), and their distances [E] in pixels.
+    """Return the pairs int [E, 2] of neighboring pixels (8-neighborhood), and their distances [E] in pixels.
 
     Pixels are numbered row by row.
 
@@ -59,7 +59,7 @@ def find_depth_edges(
     Args:
         relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet, which gives None.
         small: (h, w), the size for segmentation.
-        pairs: int [E, 2], neighbouring pixels at this size.
+        pairs: int [E, 2], neighboring pixels at this size.
         length: [E], their distances in pixels.
     """
     if relief is None:

@@ -247,7 +247,7 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
 def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of the views without masks, in the order in which masks are propagated.
 
-    The next view is always the one whose camera centre is nearest to any view with a mask or earlier in this order.
+    The next view is always the one whose camera center is nearest to any view with a mask or earlier in this order.
 
     Args:
         cameras: view -> Camera, all views.

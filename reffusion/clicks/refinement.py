@@ -13,7 +13,7 @@ from reffusion import trace
 from reffusion.clicks import all_views
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.propagation import combine, count_all_votes, draw_mask, project_votes
-from reffusion.gaussians.neighbours import find_neighbours
+from reffusion.gaussians.neighbors import find_neighbors
 
 ROUGH_RIM = 0.02  # share of the larger image side: pixels this near to a rough mask's border do not vote
 
@@ -31,7 +31,7 @@ def redraw_masks(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[st
     """
     gaussians, cameras, names = views.gaussians, views.cameras, list(views.cameras)
     image_of = lambda name: views.evidence_of(name).image
-    near = find_neighbours(gaussians)
+    near = find_neighbors(gaussians)
     labels = all_views.label_gaussians(gaussians, near, cameras, masks, image_of, ROUGH_RIM)
     drawn = {name: all_views.object_mask(gaussians, labels, cameras[name], image_of(name)) for name in names}
     votes = count_all_votes(gaussians, cameras, drawn)

@@ -44,7 +44,7 @@ def masks_from_clicks(
         poses: folder of the stage `poses`, which holds the undistorted photographs.
         clicks: the key `clicks` of scene.yaml: view -> clicks in pixels of the photograph before undistortion.
         masks: view name -> bool [H, W], masks that the scene provides. Only clicks in its own view change a mask.
-        segmenter: the segmentation network; None to segment by colours and surfaces alone.
+        segmenter: the segmentation network; None to segment by colors and surfaces alone.
 
     Raises:
         ValueError: clicks are on a view that is not a training view showing the object, or that was left out because

@@ -20,7 +20,7 @@ from reffusion.clicks.fitted_views import FittedViews, transfer_marks
 from reffusion.clicks.marks import OTHER, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
 from reffusion.clicks.single_view import ViewEvidence
-from reffusion.gaussians.neighbours import find_neighbours
+from reffusion.gaussians.neighbors import find_neighbors
 from reffusion.morphology import dilate
 
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
@@ -142,7 +142,7 @@ def propagate(views: FittedViews, masks: Masks, former: Masks | None = None) -> 
     if views.evidence_of(next(iter(masks))).ask is not None:
         return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views, former)
     image_of = lambda name: views.evidence_of(name).image
-    near = find_neighbours(views.gaussians)
+    near = find_neighbors(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
     return dict(masks) | {
         name: all_views.object_mask(views.gaussians, labels, camera, image_of(name))

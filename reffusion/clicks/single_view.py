@@ -1,7 +1,7 @@
 """Segmentation of one photograph by clicks.
 
-Cuts along colours and edges of surfaces propose regions, and so does a segmentation network if there is one. The
-proposed region whose border best follows edges of surfaces and of colours is selected.
+Cuts along colors and edges of surfaces propose regions, and so does a segmentation network if there is one. The
+proposed region whose border best follows edges of surfaces and of colors is selected.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from reffusion.clicks.segmenter import Candidate, Prompt
 
 LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
 LEAST_REGION = 12  # number of pixels (at the size for segmentation) that a region with a click must have
-RING = 0.25  # width of the ring around a mask in which colours are compared, per square root of the mask's pixels
+RING = 0.25  # width of the ring around a mask in which colors are compared, per square root of the mask's pixels
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def _agreeing(clicks: Clicks, masks: Sequence[np.ndarray]) -> list[int]:
 def propose_masks(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
     """Return masks of the object that the positive clicks are on, bool [H, W] each; no mask without a positive click.
 
-    The first mask is found by colours and surfaces. The network's masks follow, if there is a network: all masks for
+    The first mask is found by colors and surfaces. The network's masks follow, if there is a network: all masks for
     the clicks, from part to whole, and the mask of the whole object for the clicks and the first mask's bounding box.
     """
     if not clicks.positive.any():
@@ -129,7 +129,7 @@ def segment_by_surfaces(
 ) -> np.ndarray:
     """Return bool [H, W], True = the object that the positive clicks are on, found without a segmentation network.
 
-    Colours and edges of surfaces are used. Colours alone are used if depth is unknown, or shows no edge around the
+    Colors and edges of surfaces are used. Colors alone are used if depth is unknown, or shows no edge around the
     object.
 
     Args:

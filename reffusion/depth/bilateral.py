@@ -195,10 +195,10 @@ def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
     keys, strides = _keys(coordinates)  # increasing, because `_grid` sorts them
     blur = sparse.diags(np.full(len(keys), 2.0 * len(strides)))
     for stride in strides:
-        neighbour = np.minimum(np.searchsorted(keys, keys + stride), len(keys) - 1)
-        # Only vertices that contain pixels exist; the kernel skips missing neighbours.
-        occupied = np.flatnonzero(keys[neighbour] == keys + stride)
-        link = sparse.coo_matrix((np.ones(len(occupied)), (occupied, neighbour[occupied])), shape=blur.shape)
+        neighbor = np.minimum(np.searchsorted(keys, keys + stride), len(keys) - 1)
+        # Only vertices that contain pixels exist; the kernel skips missing neighbors.
+        occupied = np.flatnonzero(keys[neighbor] == keys + stride)
+        link = sparse.coo_matrix((np.ones(len(occupied)), (occupied, neighbor[occupied])), shape=blur.shape)
         blur = blur + link + link.T
     return blur.tocsr()
 

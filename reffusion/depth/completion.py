@@ -30,7 +30,7 @@ class Plate:
     Attributes:
         ring: Width of the ring of known pixels around the hole that take part, as a fraction of the image's width.
         stiffness: Weight of bending relative to the data, in px^4. At 100 the fit averages over about 3 px.
-        edge: Colour step in the guide (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
+        edge: Color step in the guide (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
         most_unknowns: Number of pixels above which a coarser grid is solved and its solution interpolated.
     """
 

@@ -15,11 +15,11 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from reffusion.depth.completion import unit_range
 from reffusion.graph_cut import HARD, alpha_expansion
 
-JUMP = 0.025  # relative disparity step between neighbours that separates two surfaces
+JUMP = 0.025  # relative disparity step between neighbors that separates two surfaces
 MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are no surfaces
-COLOR_WEIGHT = 0.1  # weight of a pixel's colour relative to an edge between neighbours
-MIN_EDGE_COST = 0.05  # minimum cost of separating neighbours, relative to the cost where the picture is uniform
-COLOR_BINS = 12  # bins of a colour histogram along each of red, green and blue
+COLOR_WEIGHT = 0.1  # weight of a pixel's color relative to an edge between neighbors
+MIN_EDGE_COST = 0.05  # minimum cost of separating neighbors, relative to the cost where the picture is uniform
+COLOR_BINS = 12  # bins of a color histogram along each of red, green and blue
 PLANE_TOLERANCE = 0.02  # relative disparity within which a pixel lies on a plane
 MAX_UNEVENNESS = 0.04  # a segment whose median relative disparity from a plane is below this belongs to that plane
 BAND_WIDTH = 0.03  # of the width: the band around a hole in which its surfaces are compared
@@ -41,7 +41,7 @@ def label_surfaces(
 
     The known pixels are divided into surfaces by `segment_surfaces`: by the planes on which they lie, elsewhere at
     jumps in disparity. A graph cut extends the surfaces into the hole. Its boundaries follow edges of the picture, and
-    each pixel prefers a surface of its own colour.
+    each pixel prefers a surface of its own color.
 
     PAPER leaves open: the completion of depth.
 
@@ -89,7 +89,7 @@ def label_surfaces(
 def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarray) -> np.ndarray:
     """Return the labels, int [H, W], after each island in the hole has taken the nearest label around it."""
     # An island is a connected component of one label that contains no known pixel of this surface (`surfaces` is 0 at
-    # unknown pixels). It arises where a pattern in the hole has the colours of another surface.
+    # unknown pixels). It arises where a pattern in the hole has the colors of another surface.
     island = np.zeros_like(missing)
     for surface in range(1, int(surfaces.max()) + 1):
         component, _ = ndimage.label(labels == surface, np.ones((3, 3)))
@@ -102,7 +102,7 @@ def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarra
 
 
 def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of neighbouring pixels, [E, 2], and the cost [E] of giving a pair's pixels different labels."""
+    """Return pairs of neighboring pixels, [E, 2], and the cost [E] of giving a pair's pixels different labels."""
     # A pair consists of two numbers of `index`; pixels whose number is -1 take no part.
     firsts, seconds, apart = [], [], []
     for offset in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -117,9 +117,9 @@ def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _color_cost(colors: np.ndarray, surfaces: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return [K, P], the cost -log p(surface | colour) of each of the surfaces 1 to K at each of P pixels."""
+    """Return [K, P], the cost -log p(surface | color) of each of the surfaces 1 to K at each of P pixels."""
     cells = (colors * COLOR_BINS).astype(np.int64).clip(0, COLOR_BINS - 1)
-    # The probabilities come from a colour histogram of each surface; all surfaces are equally probable a priori.
+    # The probabilities come from a color histogram of each surface; all surfaces are equally probable a priori.
     counts = np.zeros((int(surfaces.max()), COLOR_BINS, COLOR_BINS, COLOR_BINS))
     for k in range(len(counts)):
         np.add.at(counts[k], tuple(cells[surfaces == k + 1].T), 1.0)
@@ -155,7 +155,7 @@ def _at(values: np.ndarray, domain: np.ndarray) -> np.ndarray:
 
 
 def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of pixels and of their neighbours at `offset`, (row >= 0, column)."""
+    """Return int [E] and int [E], the numbers of pixels and of their neighbors at `offset`, (row >= 0, column)."""
     height, width = index.shape
     rows_down, right = offset
     first_column = max(0, -right)
@@ -241,7 +241,7 @@ def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarra
 
 
 def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of neighbouring pixels without a jump in disparity between them."""
+    """Return int [E] and int [E], the numbers of neighboring pixels without a jump in disparity between them."""
     firsts, seconds = [], []
     for offset in ((0, 1), (1, 0)):
         first, second = _neighbor_pairs(index, offset)
@@ -255,7 +255,7 @@ def _label_foreground(
 ) -> np.ndarray:
     """Return int [P], for each known pixel the number of the foreground object to which it belongs, or 0."""
     # The known pixels in a band around the hole are divided into segments without jumps in disparity. `smooth` [P, P]
-    # is nonzero for neighbouring known pixels without a jump.
+    # is nonzero for neighboring known pixels without a jump.
     in_band = known & (ndimage.distance_transform_edt(~hole) <= BAND_WIDTH * hole.shape[1])
     band = np.flatnonzero(in_band[known])
     _, component = connected_components(smooth[band][:, band], directed=False)

@@ -40,8 +40,8 @@ CHANGE_DECAY, SMALL_CHANGE = (
 _SAMPLES = (2 * WINDOW_HALF // WINDOW_STRIDE + 1) ** 2
 _NEIGHBORS = np.array(
     [(0, 1), (0, -1), (1, 0), (-1, 0), (0, 5), (0, -5), (5, 0), (-5, 0)]
-)  # (row, column) offsets in units of `spacing`: each is odd, so it leads to the other colour, see `_spread`
-_CANDIDATES = len(_NEIGHBORS) + 2  # planes tried at a pixel: those of its neighbours, and two random changes of its own
+)  # (row, column) offsets in units of `spacing`: each is odd, so it leads to the other color, see `_spread`
+_CANDIDATES = len(_NEIGHBORS) + 2  # planes tried at a pixel: those of its neighbors, and two random changes of its own
 
 
 def estimate_planes(
@@ -126,11 +126,11 @@ def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 @kernel
-def _bilateral_weights(colour, row, column, spacing, weights):
+def _bilateral_weights(color, row, column, spacing, weights):
     """Write the bilateral weights of the samples of a window to `weights`, [_SAMPLES], and return their sum."""
-    # `colour` has levels from 0 to 255. `spacing` is the factor on the window's size in pixels: 1 for a picture
+    # `color` has levels from 0 to 255. `spacing` is the factor on the window's size in pixels: 1 for a picture
     # `REFERENCE_WIDTH` wide, 2 for one twice as wide.
-    height, width = colour.shape[:2]
+    height, width = color.shape[:2]
     n, total = 0, 0.0
     for down in range(-WINDOW_HALF, WINDOW_HALF + 1, WINDOW_STRIDE):
         for across in range(-WINDOW_HALF, WINDOW_HALF + 1, WINDOW_STRIDE):
@@ -139,7 +139,7 @@ def _bilateral_weights(colour, row, column, spacing, weights):
             if y >= 0 and y < height and x >= 0 and x < width:
                 difference = 0.0
                 for k in range(3):
-                    difference += abs(colour[y, x, k] - colour[row, column, k])
+                    difference += abs(color[y, x, k] - color[row, column, k])
                 weights[n] = np.exp(
                     -difference / COLOR_SCALE - np.sqrt(float(down * down + across * across)) / DISTANCE_SCALE
                 )
@@ -149,9 +149,9 @@ def _bilateral_weights(colour, row, column, spacing, weights):
 
 
 @kernel
-def _matching_cost(grey, rays, rotation, translation, picture, size, row, column, plane, spacing, weights, total):
+def _matching_cost(gray, rays, rotation, translation, picture, size, row, column, plane, spacing, weights, total):
     """Return 1 - the correlation of a window with the window that `plane` maps to in another view, at most 1."""
-    # `rotation` and `translation` are those of `_homography`, `picture` is the other view in grey, padded by
+    # `rotation` and `translation` are those of `_homography`, `picture` is the other view in gray, padded by
     # `_stack_padded`, and `size` its size before padding. `weights` and `total` are those of `_bilateral_weights`.
     height, width = size
     n, covered = 0, 0.0
@@ -176,7 +176,7 @@ def _matching_cost(grey, rays, rotation, translation, picture, size, row, column
             right, below = u - j, v - i
             upper = (1 - right) * picture[i, j] + right * picture[i, j + 1]
             lower = (1 - right) * picture[i + 1, j] + right * picture[i + 1, j + 1]
-            other, own = (1 - below) * upper + below * lower, grey[r, c]
+            other, own = (1 - below) * upper + below * lower, gray[r, c]
             covered += w
             mean_here += w * own
             mean_there += w * other
@@ -195,7 +195,7 @@ def _matching_cost(grey, rays, rotation, translation, picture, size, row, column
 
 @kernel
 def _plane_cost(
-    grey, rays, initial_disparity, rotations, translations, pictures, sizes, row, column, plane, spacing, weights, total
+    gray, rays, initial_disparity, rotations, translations, pictures, sizes, row, column, plane, spacing, weights, total
 ):
     """Return the cost of a plane at a pixel: the matching cost, and a penalty for leaving the initial depth."""
     x, y = rays[row, column, 0], rays[row, column, 1]
@@ -205,7 +205,7 @@ def _plane_cost(
     best, second = 1.0, 1.0
     for k in range(len(rotations)):
         cost = _matching_cost(
-            grey,
+            gray,
             rays,
             rotations[k],
             translations[k],
@@ -231,8 +231,8 @@ def _plane_cost(
 @kernel
 def _spread(
     tickets,
-    colour,
-    grey,
+    color,
+    gray,
     rays,
     initial_disparity,
     rotations,
@@ -248,27 +248,27 @@ def _spread(
     spacing,
 ):
     """Update the planes of half of the pixels, in a chessboard pattern, to planes of lower cost, in place."""
-    height, width = grey.shape
+    height, width = gray.shape
     weights, plane = np.empty(_SAMPLES), np.empty(3)
-    views = grey, rays, initial_disparity, rotations, translations, pictures, sizes
+    views = gray, rays, initial_disparity, rotations, translations, pictures, sizes
     # `noise` [H, W, 3] is standard normal and gives the random changes; `change_size` is a factor on them. `spacing` is
-    # that of `_bilateral_weights`, and also the factor on the distances of the neighbours.
+    # that of `_bilateral_weights`, and also the factor on the distances of the neighbors.
     while True:
         row = take_ticket(tickets)
         if row >= height:
             return
         for column in range(width):
-            # The squares of the chessboard have sides of `spacing` pixels. So the neighbours are in squares of the
-            # other colour, and their planes do not change during the update. The result does not depend on the order in
+            # The squares of the chessboard have sides of `spacing` pixels. So the neighbors are in squares of the
+            # other color, and their planes do not change during the update. The result does not depend on the order in
             # which threads take rows.
             if (row // spacing + column // spacing + parity) % 2:
                 continue
-            total = _bilateral_weights(colour, row, column, spacing, weights)
+            total = _bilateral_weights(color, row, column, spacing, weights)
             # The first iteration computes the costs of the initial planes.
             if first:
                 plane[:] = planes[row, column]
                 cost[row, column] = _plane_cost(*views, row, column, plane, spacing, weights, total)
-            # The candidates are the planes of eight neighbours and two random changes of the own plane.
+            # The candidates are the planes of eight neighbors and two random changes of the own plane.
             for candidate in range(_CANDIDATES):
                 if candidate < len(_NEIGHBORS):
                     y, x = row + spacing * _NEIGHBORS[candidate, 0], column + spacing * _NEIGHBORS[candidate, 1]

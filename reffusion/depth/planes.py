@@ -26,7 +26,7 @@ def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
     rows, columns = np.nonzero(weights > 0)
     width = disparity.shape[1]
     x, y, w = columns / width, rows / width, np.sqrt(weights[rows, columns])
-    x0, y0 = x.mean(), y.mean()  # centred, which decouples slopes and offset
+    x0, y0 = x.mean(), y.mean()  # centered, which decouples slopes and offset
     design = np.stack([x - x0, y - y0, np.ones_like(x)], 1)
     a, b, c = np.linalg.lstsq(design * w[:, None], disparity[rows, columns] * w, rcond=None)[0]
     return plane_values((a, b, c - a * x0 - b * y0), disparity.shape)
@@ -113,7 +113,7 @@ def planar_model(
 
 
 def _at_pixel_centers(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return [H, W], the values of a plane, given by its coefficients [3], at pixel centres."""
+    """Return [H, W], the values of a plane, given by its coefficients [3], at pixel centers."""
     a, b, c = plane
     return plane_values((a, b, c + 0.5 * (a + b) / shape[1]), shape)
 

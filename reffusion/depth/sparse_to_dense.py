@@ -1,4 +1,4 @@
-"""Dense depth of a photograph, interpolated between sparse points with the help of the photograph's colours.
+"""Dense depth of a photograph, interpolated between sparse points with the help of the photograph's colors.
 
 It serves scenes with few photographs. A fit of Gaussians explains few photographs by Gaussians just in front of each
 camera, while structure from motion knows where surfaces are.
@@ -18,13 +18,13 @@ from reffusion.types import Camera
 MIN_POINTS = 30  # visible points that a view needs
 NEIGHBORS = 16  # number of nearest points from which each pixel is interpolated
 REFERENCE_WIDTH = 320  # px: distances are measured as if pictures were this wide
-COLOR_WEIGHT = 0.25  # such pixels per unit of CIELAB: the distance that a difference in colour adds
+COLOR_WEIGHT = 0.25  # such pixels per unit of CIELAB: the distance that a difference in color adds
 MIN_DISTANCE = 2.0  # such pixels: nearer points get hardly more weight
 OCCLUSION_NEIGHBORS, OCCLUSION_RATIO = (
     8,
     1.06,
-)  # a point is occluded if most of this many neighbours exceed its disparity by this factor
-MAX_COLOR_DIFFERENCE = 30  # levels of 255: a point whose colour differs more from the photograph is occluded
+)  # a point is occluded if most of this many neighbors exceed its disparity by this factor
+MAX_COLOR_DIFFERENCE = 30  # levels of 255: a point whose color differs more from the photograph is occluded
 MAX_EXTRAPOLATION = 2.0  # factor by which the plane of a point may change its disparity on the way to a pixel
 NORMAL_NEIGHBORS = 10  # nearest points that a normal is fitted to
 REWEIGHTINGS = 4  # of the fit of a normal, so that points of another surface lose their weight
@@ -47,7 +47,7 @@ class SparsePoints:
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> SparsePoints:
-        """Build `SparsePoints`, with normals estimated by robust fits of planes to the neighbours of each point.
+        """Build `SparsePoints`, with normals estimated by robust fits of planes to the neighbors of each point.
 
         Args:
             positions: [P, 3] with P >= `NORMAL_NEIGHBORS`.
@@ -98,7 +98,7 @@ class DepthSamples:
 def visible_samples(points: SparsePoints, camera: Camera, image: np.ndarray) -> DepthSamples:
     """Return the sparse points that are visible in a photograph, as samples of its depth.
 
-    A visible point lies in the photograph's frame, is not behind most of the points around it, and has about the colour
+    A visible point lies in the photograph's frame, is not behind most of the points around it, and has about the color
     of the photograph at its pixel.
 
     Args:
@@ -116,7 +116,7 @@ def visible_samples(points: SparsePoints, camera: Camera, image: np.ndarray) -> 
 def interpolate_depth(samples: DepthSamples, camera: Camera, image: np.ndarray) -> np.ndarray | None:
     """Return the depth of a photograph at every pixel, interpolated between samples: [H, W] float64 camera z.
 
-    Each pixel uses the samples that are nearest to it in position and colour, so that samples across an edge do not
+    Each pixel uses the samples that are nearest to it in position and color, so that samples across an edge do not
     count. Each of these samples proposes the disparity of its plane at the pixel, and the weighted median of the
     proposals is taken. With the median, depth steps from one surface to the next instead of sloping.
 
@@ -134,8 +134,8 @@ def interpolate_depth(samples: DepthSamples, camera: Camera, image: np.ndarray) 
     scale = REFERENCE_WIDTH / camera.width
     columns, rows = samples.pixels.astype(int).T
     height, width = lab.shape[:2]
-    centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    pixel_features = np.concatenate([scale * centres, COLOR_WEIGHT * lab], -1)
+    centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    pixel_features = np.concatenate([scale * centers, COLOR_WEIGHT * lab], -1)
     sample_features = np.column_stack([scale * samples.pixels, COLOR_WEIGHT * lab[rows, columns]])
     neighbors = min(NEIGHBORS, len(sample_features))
     distance, index = cKDTree(sample_features).query(pixel_features.reshape(-1, sample_features.shape[1]), k=neighbors)

@@ -10,10 +10,10 @@ from reffusion.gaussians.surfels import one_sided_slope
 # Half the side of the window in which the surfaces beside a step are found: of the image's width, and at least in px.
 WINDOW, LEAST_WINDOW_PX = 0.01, 4
 STEP = 0.04  # least bend of the disparity, relative to the disparity, from which a pixel lies beside a step
-ON_RAMP = 0.01  # weight of a neighbour at which the depth changes as fast as at a step
+ON_RAMP = 0.01  # weight of a neighbor at which the depth changes as fast as at a step
 SAMPLES = 9  # number of rows, and of columns, of the window that are used
 CHUNK = 2**16  # number of pixels that are computed together
-COLOR = 20.0  # of 255: colour difference at which the weight of a neighbour falls to 1 / e
+COLOR = 20.0  # of 255: color difference at which the weight of a neighbor falls to 1 / e
 
 
 def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -21,7 +21,7 @@ def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> n
 
     A rendering of Gaussians, and a smooth continuation, blend the depths of two surfaces along their border. A Gaussian
     at such a depth would hang in the air as a streak along the line of sight. Each pixel beside a step gets the
-    weighted median of the surfaces around it, where pixels of its own colour weigh more.
+    weighted median of the surfaces around it, where pixels of its own color weigh more.
 
     Args:
         depth: [H, W], camera z, positive.
@@ -41,7 +41,7 @@ def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> n
         near = (place[:, None] + offsets).clip(0, np.array(depth.shape) - 1)
         moved = np.moveaxis(place[:, None] - near, -1, 0)
         at, near = tuple(place.T), tuple(np.moveaxis(near, -1, 0))
-        # The surface around each neighbour, continued to the pixel as a plane, whose disparity is linear.
+        # The surface around each neighbor, continued to the pixel as a plane, whose disparity is linear.
         values = disparity[near] + slopes[0][near] * moved[0] + slopes[1][near] * moved[1]
         difference = np.abs(colors[near] - colors[at][:, None]).max(-1)
         weights = np.exp(-difference / COLOR) * np.where(ramp[near], ON_RAMP, 1.0)

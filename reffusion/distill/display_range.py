@@ -1,4 +1,4 @@
-"""The limitation of rendered colours to the range of an 8-bit image."""
+"""The limitation of rendered colors to the range of an 8-bit image."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from torch.autograd.function import once_differentiable
 
 
 def clamp_to_display(color: Tensor) -> Tensor:
-    """Clamp colours to [0, 1]. The gradient passes unless a step against it would move a colour further out of [0, 1].
+    """Clamp colors to [0, 1]. The gradient passes unless a step against it would move a color further out of [0, 1].
 
-    PAPER leaves open: colours above 1. Spherical harmonics can produce them, and neither the prior nor the critic was
-    trained on such colours. A plain clamp has no gradient there, so such colours would never return. If every gradient
+    PAPER leaves open: colors above 1. Spherical harmonics can produce them, and neither the prior nor the critic was
+    trained on such colors. A plain clamp has no gradient there, so such colors would never return. If every gradient
     passed, white could grow without limit.
     """
     return _ClampToDisplay.apply(color)

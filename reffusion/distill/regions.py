@@ -24,7 +24,7 @@ class VoxelRegion:
         home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those within `reach` voxels of a masked
             Gaussian of the initialization (see `build_region`).
         foreign: bool [X, Y, Z], True at voxels in which no unmasked Gaussian may be: those that held a masked Gaussian
-            of the initialization, while neither they nor their 26 neighbours held an unmasked one.
+            of the initialization, while neither they nor their 26 neighbors held an unmasked one.
     """
 
     origin: Tensor
@@ -40,7 +40,7 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
     on the surfaces to be invented, so they define the region.
 
     Args:
-        means: [N, 3], the centres of all Gaussians of the initialization.
+        means: [N, 3], the centers of all Gaussians of the initialization.
         masked: bool [N], True for masked Gaussians, of which there is at least one.
         resolution: Number of voxels along the diagonal of the bounding box of the masked Gaussians.
         reach: Number of voxels along each axis by which a masked Gaussian may be away from the masked Gaussians of the
@@ -70,7 +70,7 @@ def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Te
 
     Args:
         region: The region of the initialization.
-        means: [N, 3], the present centres.
+        means: [N, 3], the present centers.
         masked: bool [N], True for masked Gaussians.
     """
     cells, is_inside = _grid_cells(means, region.origin, region.voxel, region.home.shape)

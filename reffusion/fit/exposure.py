@@ -1,12 +1,12 @@
-"""Exposure compensation: an affine colour map for each view, optimised with the scene (as in the code of 3DGS).
+"""Exposure compensation: an affine color map for each view, optimised with the scene (as in the code of 3DGS).
 
 A phone changes its exposure while it moves around a scene. Without compensation Gaussians learn the mean of the
-exposures, or colours that change with the viewing direction. With compensation all Gaussians have one exposure, and
+exposures, or colors that change with the viewing direction. With compensation all Gaussians have one exposure, and
 later stages use photographs normalised to this exposure. A view without a photograph takes an average of the exposures
 of nearby photographs.
 
-The *exposure* of a view is an affine map [3, 4] from the colours of the Gaussians to the colours of the photograph:
-photo = exposure[:, :3] @ colour + exposure[:, 3], with colours in [0, 1].
+The *exposure* of a view is an affine map [3, 4] from the colors of the Gaussians to the colors of the photograph:
+photo = exposure[:, :3] @ color + exposure[:, 3], with colors in [0, 1].
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ BANDWIDTHS = (0.5, 1.0, 2.0, 4.0, 16.0)
 BLUR = 0.01  # share of the image's width: standard deviation of the blur before a view and its photograph are compared
 MIN_COVERAGE, MIN_PIXELS = 0.5, 100  # share of usable pixels around a compared pixel, and number of such pixels
 ERROR_SCALE, REWEIGHTINGS = 0.03, 8  # difference above which a pixel gets a lower weight, and number of reweightings
-# Bounds of a fitted gain; standard deviation of the colours above which gain and offset can be separated.
+# Bounds of a fitted gain; standard deviation of the colors above which gain and offset can be separated.
 GAIN_BOUNDS, MIN_SPREAD = (0.4, 2.5), 0.02
 PROTOCOL = (
     "the photographs differ in brightness: each channel of a test view is as bright as its photograph is outside the "
@@ -49,8 +49,8 @@ _IDENTITY = torch.eye(3, 4)
 class Exposures:
     """The exposures of V views, and the Adam optimiser that fits them together with the Gaussians.
 
-    Each view has a matrix [3, 4]: photo = matrix[:, :3] @ colour + matrix[:, 3]. Multiplying all matrices by one
-    matrix, and all colours by the inverse of this matrix, leaves the pictures unchanged. So the mean of the matrices is
+    Each view has a matrix [3, 4]: photo = matrix[:, :3] @ color + matrix[:, 3]. Multiplying all matrices by one
+    matrix, and all colors by the inverse of this matrix, leaves the pictures unchanged. So the mean of the matrices is
     kept at the identity. PAPER leaves open: exposure compensation, which it does not mention.
     """
 
@@ -72,9 +72,9 @@ class Exposures:
         self._adam = torch.optim.Adam(list(self._matrices.values()), lr=LEARNING_RATE, eps=1e-15)
 
     def apply(self, color: Tensor, name: str) -> Tensor:
-        """Return the colours [H, W, 3] with the exposure of view `name` applied.
+        """Return the colors [H, W, 3] with the exposure of view `name` applied.
 
-        Differentiable in the colours and in the exposure. The result is not clamped.
+        Differentiable in the colors and in the exposure. The result is not clamped.
         """
         matrix = self._matrices[name]
         return color @ matrix[:, :3].T + matrix[:, 3]
@@ -150,7 +150,7 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
 
 def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -> np.ndarray:
     """Return the distances [V, K] between the poses of V views and of K fitted cameras."""
-    # The distance is the length of a vector of six numbers: the difference of the two camera centres (normalised frame)
+    # The distance is the length of a vector of six numbers: the difference of the two camera centers (normalised frame)
     # and the difference of the two unit viewing directions, with equal weight.
     features = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
     return np.linalg.norm(features(views)[:, None] - features(fitted_cameras)[None], axis=-1)
@@ -164,11 +164,11 @@ def _kernel_weights(distances: np.ndarray) -> np.ndarray:
 
 
 def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
-    """Return the colours [H, W, 3] of rendered Gaussians with an exposure [3, 4] applied, not clamped.
+    """Return the colors [H, W, 3] of rendered Gaussians with an exposure [3, 4] applied, not clamped.
 
     Args:
         color: [H, W, 3] in [0, 1].
-        matrix: [3, 4]; None returns the colours unchanged.
+        matrix: [3, 4]; None returns the colors unchanged.
     """
     if matrix is None:
         return color
@@ -285,12 +285,12 @@ def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
 
 
 def undo_exposure(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
-    """Return the colours of the Gaussians for the colours [H, W, 3] of a photograph; the inverse of `apply_exposure`.
+    """Return the colors of the Gaussians for the colors [H, W, 3] of a photograph; the inverse of `apply_exposure`.
 
     The result is not clamped.
 
     Args:
         color: [H, W, 3] in [0, 1].
-        matrix: [3, 4]; None returns the colours unchanged.
+        matrix: [3, 4]; None returns the colors unchanged.
     """
     return color if matrix is None else (color - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T

@@ -44,13 +44,13 @@ def gaussians_on_surfaces(
     The first pass over the views adds Gaussians for the pixels whose depth another view confirms, in each view only
     where the Gaussians of earlier views leave gaps. The second pass adds, in the same way, the pixels whose depth is
     neither confirmed nor refuted (refuted: a confirmed pixel of another view sees past the surface). Pixels beside a
-    nearer surface are left out, because the colour of the nearer surface bleeds into them.
+    nearer surface are left out, because the color of the nearer surface bleeds into them.
 
     Args:
         cameras: the training views.
         images: view name -> uint8 [H, W, 3], with equal exposure.
         points: [P, 3] sparse points.
-        colors: [P, 3] uint8, their colours.
+        colors: [P, 3] uint8, their colors.
         hidden: view name -> bool [H, W], True for pixels to be ignored; a view without an entry has none.
         params: sets the seed, the degree of spherical harmonics, the device and antialiasing.
 
@@ -83,7 +83,7 @@ def gaussians_on_surfaces(
 def is_beside_nearer(depth: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
 
-    The colour of the nearer surface bleeds into these pixels. A pixel next to it is one whose depth exceeds
+    The color of the nearer surface bleeds into these pixels. A pixel next to it is one whose depth exceeds
     `OCCLUSION_RATIO` times the smallest depth in the 3 x 3 pixels around it.
     """
     return depth > OCCLUSION_RATIO * ndimage.minimum_filter(depth, NEIGHBORHOOD_PX)

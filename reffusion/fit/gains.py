@@ -11,10 +11,10 @@ from reffusion.capture.image_detail import sample_visible
 from reffusion.types import Camera
 
 MAX_POINTS = 5000  # maximum number of points at which photographs are compared
-BLUR = 0.004  # share of the image's width: standard deviation of the blur before colours are sampled
-DARK, BRIGHT = 8, 247  # levels of 255: colours outside are too dark, or clipped
+BLUR = 0.004  # share of the image's width: standard deviation of the blur before colors are sampled
+DARK, BRIGHT = 8, 247  # levels of 255: colors outside are too dark, or clipped
 REWEIGHTINGS = 10  # iterations of reweighted least squares
-ERROR_SCALE = 0.1  # residual of a log colour above which it gets a lower weight: the point is occluded, or specular
+ERROR_SCALE = 0.1  # residual of a log color above which it gets a lower weight: the point is occluded, or specular
 PRIOR_WEIGHT = 1e-3  # pull of a view towards the mean, in points; it decides only for a view that shares no points
 
 
@@ -22,7 +22,7 @@ def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mappin
     """Estimate the brightness of each view's red, green and blue relative to the geometric mean of all views.
 
     Brightness is measured in sRGB values, which are not linearised. The estimate is a robust least-squares fit to the
-    logarithms of colours, with one unknown per view (its brightness) and one per point (its colour). Colours that are
+    logarithms of colors, with one unknown per view (its brightness) and one per point (its color). Colors that are
     too dark or clipped are left out.
 
     Args:
@@ -57,13 +57,13 @@ def _blur(photo: np.ndarray) -> np.ndarray:
 
 
 def _view_offsets(values: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Split log colours [V, P] into an offset per view and a colour per point; return the offsets [V], of mean 0."""
+    """Split log colors [V, P] into an offset per view and a color per point; return the offsets [V], of mean 0."""
     offsets, weight = np.zeros(len(values)), usable.astype(np.float64)
     # Values that are not `usable` [V, P] are ignored.
     for _ in range(REWEIGHTINGS):
         total = np.maximum(weight.sum(0), 1e-12)
         centered = values - (weight * values).sum(0) / total
-        # The unknown colours of the points are eliminated, which leaves a linear system in the V offsets.
+        # The unknown colors of the points are eliminated, which leaves a linear system in the V offsets.
         system = np.diag(weight.sum(1) + PRIOR_WEIGHT) - (weight / total) @ weight.T
         offsets = np.linalg.solve(system, (weight * centered).sum(1))
         residual = values - offsets[:, None]

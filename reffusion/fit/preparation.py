@@ -127,7 +127,7 @@ def collect_points(
         hidden: view name -> bool [H, W], True for pixels that do not supervise.
 
     Returns:
-        Positions [P, 3] float64 and colours [P, 3] uint8, sparse points first.
+        Positions [P, 3] float64 and colors [P, 3] uint8, sparse points first.
     """
 
     points, colors = scene.points, scene.point_colors

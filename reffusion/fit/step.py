@@ -68,7 +68,7 @@ def step(
 
     Args:
         optimizer: holds the Gaussians, which are updated in place.
-        exposures: exposures of the views, which are updated, too; None leaves colours as they are rendered.
+        exposures: exposures of the views, which are updated, too; None leaves colors as they are rendered.
         camera: the view.
         target: [H, W, 3] in [0, 1], its photograph.
         counts: [H, W], weights of its pixels; None: all 1.
@@ -129,7 +129,7 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 def coarse_steps(settings: Params) -> int:
     """Return the number of steps, at the start, that use views of half the size.
 
-    With a dense start positions are known. Sizes and colours are learnt first, and small views are enough for these.
+    With a dense start positions are known. Sizes and colors are learnt first, and small views are enough for these.
     Without a dense start the number is 0, as in 3DGS.
     """
     return round(COARSE_SHARE * settings.iterations) if settings.init.flow_cell else 0

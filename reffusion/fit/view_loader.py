@@ -78,7 +78,7 @@ def downsample(
     """Return the view (camera, image and weights) at half its size, rounded up.
 
     A pixel of the small view gets the lowest weight around the upper left pixel of its area: among 3 x 3 pixels, or
-    5 x 5 in views of odd size, whose areas overlap three pixels. So a colour to which a pixel of weight 0 contributes
+    5 x 5 in views of odd size, whose areas overlap three pixels. So a color to which a pixel of weight 0 contributes
     has weight 0.
     """
     size = (camera.width + 1) // 2, (camera.height + 1) // 2

@@ -112,7 +112,7 @@ def _products_along_rows(
 
 @triton.jit
 def _filtered(field, taps, at, step, low, high, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
-    """Return the window sums around the elements `at` of a field; neighbouring pixels are `step` elements apart."""
+    """Return the window sums around the elements `at` of a field; neighboring pixels are `step` elements apart."""
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(2 * RADIUS + 1):
         to = at + (k - RADIUS) * step

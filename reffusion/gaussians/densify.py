@@ -61,7 +61,7 @@ def densify(
 
 
 def viewing_distance(means: Tensor, centers: Tensor) -> Tensor:
-    """Return the distance [N] of each mean [N, 3] to the nearest camera centre [V, 3].
+    """Return the distance [N] of each mean [N, 3] to the nearest camera center [V, 3].
 
     The stage `fit` measures sizes of Gaussians in units of this distance.
     """
@@ -71,7 +71,7 @@ def viewing_distance(means: Tensor, centers: Tensor) -> Tensor:
 def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
     """Return two children for each of M Gaussians, at positions sampled from it and smaller by the factor `SHRINK`.
 
-    Rotation, opacity and colour are those of the parent.
+    Rotation, opacity and color are those of the parent.
 
     Returns:
         2 M Gaussians: the first child of every parent, then the second child of every parent.

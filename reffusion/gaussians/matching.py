@@ -16,13 +16,13 @@ from scipy.spatial import ConvexHull, cKDTree
 from reffusion.gaussians.movement import SAME_LOOKS, Cloud, Movement, find_movement
 
 CANDIDATES = 8  # nearest Gaussians of the whole scene with which a Gaussian of the cleaned scene is compared
-# Matching radius of a Gaussian of the whole scene, as a share of the distance to its nearest neighbour: within it a
+# Matching radius of a Gaussian of the whole scene, as a share of the distance to its nearest neighbor: within it a
 # position of the cleaned scene counts as the Gaussian's own position, moved by quantisation.
 MAX_DISTANCE = 0.5
 # Least radius, as a share of the median of these distances; it matters for several Gaussians at one position.
 MIN_SPACING = 0.1
 SAMPLE_SIZE = 5000  # Gaussians of the cleaned scene by which axis flips and different scenes are detected
-QUERY_SIZE = 100_000  # points per query of neighbours
+QUERY_SIZE = 100_000  # points per query of neighbors
 HULL_SIZE = 5_000  # points that are compared at once with the facets of a convex hull
 # Shares of a sample of the cleaned scene from which on it was not moved: of exact positions, and of positions nearby. A
 # scene that another one was merged into has less, but `find_movement` finds that it was not moved.
@@ -31,7 +31,7 @@ MOSTLY_ALIKE = 0.5  # share of nearest pairs of one look above which all pairs m
 MIN_FOUND_SHARE = 0.05  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
 # A deleted Gaussian is a core if so large a share of its NEIGHBORS nearest Gaussians was deleted, too. Connected cores
 # form a hole if there are at least LEAST_CORES. A deleted Gaussian belongs to the hole if it is at most REACH times as
-# far from the nearest core as that core's farthest neighbour is.
+# far from the nearest core as that core's farthest neighbor is.
 NEIGHBORS, CORE_SHARE, LEAST_CORES, REACH = 16, 1 / 3, 16, 2.0
 # Gaussians less opaque than this quantile of those that stay were filtered, if they are so large a share of the scene.
 FILTER_RANK, LEAST_FILTERED = 0.001, 0.02
@@ -66,8 +66,8 @@ def match_gaussians(whole: Cloud, cleaned: Cloud) -> Match:
     """Match the Gaussians of a cleaned scene to those of the whole scene, one to one and the nearest pairs first.
 
     Most editors keep positions to the last bit; equal positions are matched by sorting. Some editors quantize
-    positions. This moves a Gaussian by far less than the distance to its neighbours, even in a compressed .ply, whose
-    steps are 1/2000 of the extent of 256 neighbours. Where neither is the case, the scene was moved, or another one was
+    positions. This moves a Gaussian by far less than the distance to its neighbors, even in a compressed .ply, whose
+    steps are 1/2000 of the extent of 256 neighbors. Where neither is the case, the scene was moved, or another one was
     added; `find_movement` then compares how Gaussians look.
 
     Args:
@@ -229,7 +229,7 @@ def _hash_positions(points: np.ndarray) -> np.ndarray:
 
 
 class _NearIndex:
-    """Index of a scene's Gaussians by position, with a matching radius for each that depends on its neighbours."""
+    """Index of a scene's Gaussians by position, with a matching radius for each that depends on its neighbors."""
 
     def __init__(self, whole: Cloud):
         self.whole, self.tree = whole, cKDTree(whole.means)
@@ -243,7 +243,7 @@ class _NearIndex:
     def radius(self, splats: np.ndarray) -> np.ndarray:
         """Return the matching radii of Gaussians of the scene, as float32 of the shape of `splats`.
 
-        The radius of a Gaussian is `MAX_DISTANCE` times the distance to its nearest neighbour, but not below the least
+        The radius of a Gaussian is `MAX_DISTANCE` times the distance to its nearest neighbor, but not below the least
         radius (see `MIN_SPACING`).
 
         Args:

@@ -16,7 +16,7 @@ from reffusion.types import Camera, Gaussians
 class Sheets:
     """Settings of the Gaussians on a surface: a first sheet of faint ones, and a more opaque second sheet behind it.
 
-    Opaque neighbouring Gaussians cannot show a sharp picture from all sides. On a slanted surface each Gaussian
+    Opaque neighboring Gaussians cannot show a sharp picture from all sides. On a slanted surface each Gaussian
     occludes the near side of the next one behind it. So the texture appears shifted away from the camera by a third of
     the Gaussians' spacing, and between opposite views by twice this distance. Fainter Gaussians reduce the shift; the
     second sheet keeps the surface closed. Figures are in docs/method.md#initialization.
@@ -31,10 +31,10 @@ class Sheets:
         opacity: opacity of the first sheet's Gaussians, in (0, 1).
         offset_px: distance of the second sheet behind the first one, in pixels; 0: there is no second sheet.
         under_spread, under_opacity: `spread` and `opacity` of the second sheet. Its Gaussians are wider so that they
-            leave no gaps, which a nearer view would show as a grid. The colours of the first sheet compensate for the
+            leave no gaps, which a nearer view would show as a grid. The colors of the first sheet compensate for the
             blur.
-        color_steps: number of corrections of the colours, see `reffusion.initialize.unprojection.match_colors`.
-        view_dependent: True makes the colours change with the viewing direction, as the colours of the surface around
+        color_steps: number of corrections of the colors, see `reffusion.initialize.unprojection.match_colors`.
+        view_dependent: True makes the colors change with the viewing direction, as the colors of the surface around
             the hole do, see `reffusion.initialize.view_dependent_color`.
     """
 

@@ -35,7 +35,7 @@ def surface_gaussians(
     PAPER leaves open: scale and opacity of the initial Gaussians. The defaults reproduce the reference's picture.
 
     Args:
-        image: [H, W, 3], the colours, uint8 or floating point in [0, 1].
+        image: [H, W, 3], the colors, uint8 or floating point in [0, 1].
         depth: [H, W] camera z, positive on the chosen pixels.
         pixels: bool [H, W], True for the chosen pixels.
         camera: the view.

@@ -26,7 +26,7 @@ from reffusion.types import Camera, Gaussians, Reference, Rendering
 EDGE = 0.03  # relative difference of depth from which two surfaces are different ones
 NARROW = 0.02  # largest width of a gap that is too narrow to show texture, as a fraction of the image's width
 MAX_ANGLE = 45.0  # degrees: largest angle from the axis of a camera without a photograph to the nearest one with one
-MIN_SHARE = 0.001  # a view is completed only if a larger share of its C is uncovered; neighbours complete the rest
+MIN_SHARE = 0.001  # a view is completed only if a larger share of its C is uncovered; neighbors complete the rest
 ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of uncovered pixels are dropped, smaller holes filled
 
 
@@ -207,7 +207,7 @@ def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Referenc
 def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the pixels on the farther side of a depth edge whose surface belongs to the remaining scene.
 
-    In a completed view the colour of the nearer surface bleeds into these pixels. Photographs show them without it.
+    In a completed view the color of the nearer surface bleeds into these pixels. Photographs show them without it.
 
     Args:
         depth: [H, W], camera z of the surfaces in the completed view.

@@ -91,6 +91,6 @@ def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, 
     # Without a feed-forward inpainter, patches are taken from the photographs and completed views in `sources`.
     if painter is not None:
         return painter.paint(base, region)
-    if coverage.is_narrow(hole):  # a narrow gap shows no texture; continuing the adjacent colours is enough
+    if coverage.is_narrow(hole):  # a narrow gap shows no texture; continuing the adjacent colors is enough
         return classical.telea(base, region)
     return next(exemplar.complete_view(base, region, camera, mask, sources, [SEED])).image

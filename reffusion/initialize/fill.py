@@ -116,8 +116,8 @@ def fill_reference(
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
     over = reference.mask & ~mask  # an inserted object, drawn over the remaining scene
-    # New Gaussians change colour with direction as their surroundings do. An inserted object does not: it has a shine
-    # of its own. An extra view is too narrow to show how colours change.
+    # New Gaussians change color with direction as their surroundings do. An inserted object does not: it has a shine
+    # of its own. An extra view is too narrow to show how colors change.
     sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not over.any())
     hole = unprojection.find_hole(draft, reference, mask, COVERED)
     if farthest and background.mirrors:

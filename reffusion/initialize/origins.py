@@ -17,11 +17,11 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, MaskSet, Rendering
 
 SOURCES = 8  # photographs, at most, with which a view is compared
-CONFLICT = 30.0  # levels of 255: mean difference of the channels from which colours are in conflict
+CONFLICT = 30.0  # levels of 255: mean difference of the channels from which colors are in conflict
 STRIDE = 4  # px between the pixels that are compared
-BLUR = 0.004  # of the image's width: blur before colours are compared
+BLUR = 0.004  # of the image's width: blur before colors are compared
 
-# Origins of pixels, in the order of the values of `OriginMap.classes`, and the colours of their pictures, RGB.
+# Origins of pixels, in the order of the values of `OriginMap.classes`, and the colors of their pictures, RGB.
 COLORS = {
     "outside": (0, 0, 0),
     "photographs": (40, 170, 70),
@@ -39,7 +39,7 @@ class OriginMap:
 
     Attributes:
         classes: uint8 [H, W], index into `ORIGINS`: outside; a surface that other photographs show; conflict, i.e. such
-            a surface, or one of a reference, that photographs show in another colour; a reference; patches in an extra
+            a surface, or one of a reference, that photographs show in another color; a reference; patches in an extra
             view; nothing, i.e. a surface that no picture shows, or a gap. Pixels outside C that show new Gaussians have
             an origin, too.
         uncovered_share: share in [0, 1] of the pixels of C that show a gap; 0 if C is empty.
@@ -50,7 +50,7 @@ class OriginMap:
 
     @property
     def picture(self) -> np.ndarray:
-        """The origins in colours, uint8 [H, W, 3]."""
+        """The origins in colors, uint8 [H, W, 3]."""
         return np.array(list(COLORS.values()), np.uint8)[self.classes]
 
     @property
@@ -89,7 +89,7 @@ def find_origins(draft: Draft, camera: Camera, masks: MaskSet, background: Backg
 
 
 def _find_conflicts(rendering: Rendering, camera: Camera, pixels: np.ndarray, background: Background) -> np.ndarray:
-    """Return bool [H, W], the `pixels` whose surface photographs show in another colour than the rendering does."""
+    """Return bool [H, W], the `pixels` whose surface photographs show in another color than the rendering does."""
     grid = np.zeros_like(pixels)
     grid[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE] = True
     rows, columns = np.nonzero(pixels & grid)

@@ -30,7 +30,7 @@ def bounding_box(means: np.ndarray) -> Box:
 
 
 def box_at(center: Sequence[float], size: Sequence[float]) -> Box:
-    """Return the axis-aligned box with this centre and these side lengths."""
+    """Return the axis-aligned box with this center and these side lengths."""
     return np.asarray(center) - np.asarray(size) / 2, np.asarray(center) + np.asarray(size) / 2
 
 
@@ -70,13 +70,13 @@ def sample_points(
 
 
 def random_gaussians(points: np.ndarray, sh_count: int, antialiased: bool, generator: torch.Generator) -> Gaussians:
-    """Return isotropic Gaussians of random colours at the points, with the sizes and opacity that 3DGS starts with.
+    """Return isotropic Gaussians of random colors at the points, with the sizes and opacity that 3DGS starts with.
 
     Args:
         points: [N, 3], N at least 4.
         sh_count: number of spherical harmonic coefficients of a Gaussian, (degree + 1)^2.
         antialiased: whether the Gaussians are meant for Mip-Splatting's 2D filter, see `types.Gaussians`.
-        generator: draws the colours.
+        generator: draws the colors.
     """
     colors = torch.randint(256, (len(points), 3), generator=generator, dtype=torch.uint8).numpy()
     degree = round(sh_count**0.5) - 1

@@ -1,4 +1,4 @@
-"""Plane sweep stereo: the depth of one photograph around a hole, found by comparing it with neighbouring photographs.
+"""Plane sweep stereo: the depth of one photograph around a hole, found by comparing it with neighboring photographs.
 
 The rendered depth of Gaussians is rough, and too small wherever faint Gaussians float in front of a surface. But a
 surface that continues into a hole must be accurate to a thousandth of its depth, or a step shows at the hole's border.
@@ -20,13 +20,13 @@ from reffusion.background.visibility import DepthView
 from reffusion.io.images import to_gray
 from reffusion.types import Camera
 
-NEIGHBORS = 6  # neighbouring photographs that are compared at most
-MIN_ANGLE, MAX_ANGLE = 4.0, 35.0  # degrees between a neighbour and the view, as seen from the surface
+NEIGHBORS = 6  # neighboring photographs that are compared at most
+MIN_ANGLE, MAX_ANGLE = 4.0, 35.0  # degrees between a neighbor and the view, as seen from the surface
 RANGE, STEPS = 0.03, 21  # relative disparity that is searched to either side, and the number of disparities tried
 WINDOW = 0.024  # of the image's width: side of the compared window
 SMOOTHING = 0.02  # of the image's width: side of the median filter of the initial depth; rough depth distorts windows
 MIN_CONTRAST = 2.5  # levels of 255: standard deviation in a window below which the window is too plain to be compared
-MIN_CORRELATION = 0.55  # smallest mean correlation with the better half of the neighbours at which depth is accepted
+MIN_CORRELATION = 0.55  # smallest mean correlation with the better half of the neighbors at which depth is accepted
 RING = 0.1  # of the image's width: width of the ring around a hole in which depth is searched
 
 
@@ -68,12 +68,12 @@ def sweep_depth(
         depth: [H, W], approximate depth of the view, correct to within `RANGE`; 0 where unknown.
         pixels: bool [H, W], the pixels whose depth is searched.
         camera: the view.
-        views: depth views of the scene, from which neighbours are chosen. Their masked pixels (the object's) do not
+        views: depth views of the scene, from which neighbors are chosen. Their masked pixels (the object's) do not
             count.
         photos: view name -> uint8 [H, W, 3], the photographs of `views`.
 
     Returns:
-        0 outside `pixels` and where no depth agrees well enough; everywhere if there are fewer than two neighbours.
+        0 outside `pixels` and where no depth agrees well enough; everywhere if there are fewer than two neighbors.
     """
     found = np.zeros(pixels.shape)
     pixels = pixels & (depth > 0)
@@ -134,10 +134,10 @@ def _correlation(
     photos: Mapping[str, np.ndarray],
     side: int,
 ) -> np.ndarray:
-    """Return [H, W], how well the neighbours' photographs agree with the view's if the surface is at given points."""
+    """Return [H, W], how well the neighbors' photographs agree with the view's if the surface is at given points."""
     mean = lambda values: cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     # The value is the normalised correlation of windows of `side` px over the `known` pixels, averaged over the better
-    # half of the neighbours. A neighbour whose window cannot be compared counts as -1.
+    # half of the neighbors. A neighbor whose window cannot be compared counts as -1.
     scores = []
     for view in neighbors:
         uv, z = geometry.project(points.reshape(-1, 3), view.camera)

@@ -26,8 +26,8 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians, Reference
 
-COLOR_WINDOW_PX = 2  # px: radius of the window whose darkest and brightest colours bound a Gaussian's colour
-COLOR_MARGIN = 0.1  # colours in [0, 1]: how far beyond these bounds a Gaussian's colour may lie
+COLOR_WINDOW_PX = 2  # px: radius of the window whose darkest and brightest colors bound a Gaussian's color
+COLOR_MARGIN = 0.1  # colors in [0, 1]: how far beyond these bounds a Gaussian's color may lie
 
 
 @torch.no_grad()
@@ -159,14 +159,14 @@ def add_surface(
 ) -> Draft:
     """Return the draft with pixels of a reference added, as a surface of new Gaussians.
 
-    The colours of these Gaussians are corrected so that the rendered view shows the reference (`match_colors`).
+    The colors of these Gaussians are corrected so that the rendered view shows the reference (`match_colors`).
 
     Args:
         draft: the scene that is being filled.
-        reference: the completed view, from which the colours are taken.
+        reference: the completed view, from which the colors are taken.
         depth: [H, W], camera z of the surface; positive at `pixels`.
         pixels: bool [H, W], the pixels to add.
-        background: the photographs, from which view-dependent colour is estimated.
+        background: the photographs, from which view-dependent color is estimated.
         sheets: settings of the Gaussians on a surface.
         origin: origin of the new Gaussians, see `draft.Draft`.
     """
@@ -188,16 +188,16 @@ def add_surface(
 def match_colors(
     gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
 ) -> Gaussians:
-    """Return all Gaussians, the colours of the labelled ones corrected so that a rendered view shows a given picture.
+    """Return all Gaussians, the colors of the labelled ones corrected so that a rendered view shows a given picture.
 
-    Only the constant spherical harmonic changes. Each step adds to the colour of a Gaussian the mean residual of the
+    Only the constant spherical harmonic changes. Each step adds to the color of a Gaussian the mean residual of the
     pixels that it is blended into, weighted by its blending weights. This undoes the blur of the footprints. A Gaussian
-    that others occlude cannot show the picture, whatever its colour is. Therefore colours are bounded by those of the
+    that others occlude cannot show the picture, whatever its color is. Therefore colors are bounded by those of the
     picture around the Gaussian. Otherwise an occluded Gaussian would stand out as a speck in other views.
 
     Args:
         gaussians: all N Gaussians of the scene.
-        labels: bool [N], True for the Gaussians whose colours are corrected.
+        labels: bool [N], True for the Gaussians whose colors are corrected.
         image: uint8 [H, W, 3], the picture that the view should show.
         pixels: bool [H, W], the pixels at which the picture is compared.
         camera: the view.
@@ -220,7 +220,7 @@ def match_colors(
 def _color_bounds(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the lowest and the highest constant harmonic that each Gaussian may have, [N, 3] each."""
     uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
-    # The bounds are the colours of the picture within `COLOR_WINDOW_PX` of the Gaussian's centre, with a margin of
+    # The bounds are the colors of the picture within `COLOR_WINDOW_PX` of the Gaussian's center, with a margin of
     # `COLOR_MARGIN`.
     bounds = []
     for extreme, margin in ((cv2.erode, -COLOR_MARGIN), (cv2.dilate, COLOR_MARGIN)):

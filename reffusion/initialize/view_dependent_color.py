@@ -1,8 +1,8 @@
-"""View-dependent colour of new Gaussians, estimated from the surface around the hole.
+"""View-dependent color of new Gaussians, estimated from the surface around the hole.
 
 A reference shows the new surface from one side only. A wet table, or a leaf in the sun, is brighter from another side,
-where new Gaussians of constant colour would stand out as a patch. But the photographs show the surface around the hole
-from all sides. So its change of colour from view to view is measured, and given to new Gaussians of similar colour.
+where new Gaussians of constant color would stand out as a patch. But the photographs show the surface around the hole
+from all sides. So its change of color from view to view is measured, and given to new Gaussians of similar color.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from reffusion.types import Camera, Gaussians
 
 RING = 0.1  # of the image's width: width of the ring around the hole in which the surface is sampled
 MARGIN = 0.006  # of the image's width: distance that samples keep from the object's blurred rim
-BLUR = 0.015  # of the image's width: standard deviation of the blur before colours are compared between views
+BLUR = 0.015  # of the image's width: standard deviation of the blur before colors are compared between views
 # Of the image's width: standard deviation of the blur before materials are compared. After the weaker blur `BLUR`, dark
 # spots would seem to brighten.
 COLOR_BLUR = 0.03
 MAX_SAMPLES = 3000  # sampled points at most
-NEIGHBORS = 200  # nearest samples, from which each new Gaussian takes its change of colour
-BATCH = 20_000  # new Gaussians that are handled at a time: for 200 views their neighbours take a GB
-COLOR_SIGMA = 0.08  # colours in [0, 1]: difference at which a sample's weight is 0.6; wood and steel shine differently
-NOISE = 0.012  # colours in [0, 1]: a mean change up to this is noise, and the surface matte
-MIN_SHARE = 0.05  # a view's change of colour is known where it shows this share of the neighbouring samples, by weight
-GUESS_WEIGHT = 0.3  # weight of a view whose change of colour is unknown and guessed; known ones have weight 1
+NEIGHBORS = 200  # nearest samples, from which each new Gaussian takes its change of color
+BATCH = 20_000  # new Gaussians that are handled at a time: for 200 views their neighbors take a GB
+COLOR_SIGMA = 0.08  # colors in [0, 1]: difference at which a sample's weight is 0.6; wood and steel shine differently
+NOISE = 0.012  # colors in [0, 1]: a mean change up to this is noise, and the surface matte
+MIN_SHARE = 0.05  # a view's change of color is known where it shows this share of the neighboring samples, by weight
+GUESS_WEIGHT = 0.3  # weight of a view whose change of color is unknown and guessed; known ones have weight 1
 RIDGE = 0.002  # weight of the ridge penalty, per view: it keeps harmonics small where few views determine them
 
 
 @dataclass(frozen=True)
 class ColorChange:
-    """The change of colour of the surface around a hole, from a completed view to each of V views.
+    """The change of color of the surface around a hole, from a completed view to each of V views.
 
     Attributes:
         material: [H, W, 3] float32 in [0, 1], the completed view inside the hole and its photograph outside, after a
             strong blur (`COLOR_BLUR`). It tells materials apart.
         points: [R, 3], R samples of the surface, in the world.
         colors: [R, 3], `material` at the samples.
-        change: [R, V, 3], a sample's colour in the photograph of each view minus its colour in the photograph of the
+        change: [R, V, 3], a sample's color in the photograph of each view minus its color in the photograph of the
             completed view, both in [0, 1] and blurred by `BLUR`; 0 where the view does not show the sample.
         visible: bool [R, V], True where a view shows a sample.
     """
@@ -67,7 +67,7 @@ def measure_change(
     views: Sequence[DepthView],
     photos: Mapping[str, np.ndarray],
 ) -> ColorChange:
-    """Measure how the colour of the surface around a hole changes from a completed view to each of V views.
+    """Measure how the color of the surface around a hole changes from a completed view to each of V views.
 
     Photographs are compared with photographs, because a completed view may lack the object's shadow.
 
@@ -110,17 +110,17 @@ def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
 def transfer_sh(
     gaussians: Gaussians, is_new: torch.Tensor, camera: Camera, change: ColorChange, views: Sequence[DepthView]
 ) -> Gaussians:
-    """Return all Gaussians, the new ones with harmonics whose colour changes as that of the surface around them does.
+    """Return all Gaussians, the new ones with harmonics whose color changes as that of the surface around them does.
 
-    For every view, each new Gaussian takes the mean change of colour of the neighbouring samples, weighted by distance
-    and similarity of colour, and shrunk towards 0 where the samples disagree. Its harmonics are a least squares fit to
-    these changes. Seen from `camera`, the Gaussian keeps its colour.
+    For every view, each new Gaussian takes the mean change of color of the neighboring samples, weighted by distance
+    and similarity of color, and shrunk towards 0 where the samples disagree. Its harmonics are a least squares fit to
+    these changes. Seen from `camera`, the Gaussian keeps its color.
 
     Args:
         gaussians: all N Gaussians of the scene.
         is_new: bool [N], True for the Gaussians to change.
         camera: the completed view, from which the new Gaussians were made.
-        change: the changes of colour around the hole.
+        change: the changes of color around the hole.
         views: the V views of `change`.
 
     Returns:
@@ -152,15 +152,15 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
         normal += weighted[:, :, None] * row[:, None]
         right += weighted[:, :, None] * target[:, number, None]
     # These non-constant harmonics c_k minimise the sum of squares in docs/method.md#initialization (view-dependent
-    # colour).
+    # color).
     rest = torch.linalg.solve(normal, right)
     constant = constant - (base[..., None] * rest).sum(1) / SH0
     return torch.cat([constant[:, None], rest], 1).to(batch.sh.dtype)
 
 
 def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean change of colour around each Gaussian in each view, [N, V, 3], and where it is known, [N, V]."""
-    # `own` are the colours of the Gaussians in `change.material`.
+    """Return the mean change of color around each Gaussian in each view, [N, V, 3], and where it is known, [N, V]."""
+    # `own` are the colors of the Gaussians in `change.material`.
     distance, index = cKDTree(change.points).query(means, k=NEIGHBORS)
     near = np.exp(-0.5 * (distance / np.maximum(distance[:, -1:] / 2, 1e-12)) ** 2)
     alike = np.exp(-0.5 * ((own[:, None] - change.colors[index]) ** 2).sum(-1) / COLOR_SIGMA**2)
@@ -175,14 +175,14 @@ def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) ->
     # On a mirror the change differs from point to point, and a mean of it is wrong: disagreement shrinks the mean.
     size = (mean**2).sum(-1)
     agreement = size / np.maximum(square.sum(-1), 1e-12) * np.maximum(1 - 3 * NOISE**2 / np.maximum(size, 1e-12), 0)
-    # The mean change is known where a view shows enough of the neighbours.
+    # The mean change is known where a view shows enough of the neighbors.
     return mean * agreement[..., None], share > MIN_SHARE
 
 
 def _fill_unknown_views(
     change: np.ndarray, known: np.ndarray, middle: np.ndarray, views: Sequence[DepthView]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Guess unknown changes of colour from the view with the nearest direction; return changes and weights [N, V]."""
+    """Guess unknown changes of color from the view with the nearest direction; return changes and weights [N, V]."""
     # Without the guesses, harmonics that are constrained in a few directions would take extreme values in all others.
     # Directions to the cameras are compared from `middle` [3].
     directions = np.stack([view.camera.center for view in views]) - middle

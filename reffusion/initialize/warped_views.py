@@ -29,7 +29,7 @@ ITERATIONS = 4  # of the intersection of a ray with the surface
 MATCH = 0.005  # relative difference from the depth that the view shows, above which it shows another surface
 MAX_MOVE = 0.5  # px: larger last steps have not converged
 MIN_SCALE = 0.5  # pixels of the reference per pixel of the view, along any direction; with fewer the picture is blurred
-FINE = 4  # samples along each side of a pixel, whose mean is the colour of the pixel
+FINE = 4  # samples along each side of a pixel, whose mean is the color of the pixel
 TONE_BLUR = 0.015  # of the image's width: blur that separates detail from tone
 
 
@@ -116,7 +116,7 @@ def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) ->
     mask = _smallest_scale(uv) > MIN_SCALE
     if not mask.any():
         return Reference(camera, np.zeros((*mask.shape, 3), np.uint8), mask)
-    # The detail is that of the picture. The tone is that of the rendering, because colours change with the direction
+    # The detail is that of the picture. The tone is that of the rendering, because colors change with the direction
     # (`view_dependent_color`).
     difference = 255 * rendering.color.cpu().numpy() - (picture := _sample_area(image, uv, mask))
     blur = lambda values: cv2.GaussianBlur(values, (0, 0), to_pixels(TONE_BLUR, camera.width))
@@ -150,14 +150,14 @@ def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.
 def _smallest_scale(uv: np.ndarray) -> np.ndarray:
     """Return [h, w], how many source pixels a pixel spans in the direction in which it spans fewest; NaN if unknown."""
     # `uv` [h, w, 2] is the position of each pixel in the source, NaN where it has none. The result is NaN where a
-    # neighbouring pixel has no position.
+    # neighboring pixel has no position.
     down, right = np.gradient(uv, axis=(0, 1))
     square, area = (down**2 + right**2).sum(-1), np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
     return np.sqrt((square - np.sqrt(np.maximum(square**2 - 4 * area**2, 0))) / 2)
 
 
 def _sample_area(image: np.ndarray, uv: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return [h, w, 3] float32, the mean colours under each pixel of the mask, at the positions `uv` in the picture."""
+    """Return [h, w, 3] float32, the mean colors under each pixel of the mask, at the positions `uv` in the picture."""
     # Outside the mask the result is meaningless.
     nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     size = (FINE * mask.shape[1], FINE * mask.shape[0])

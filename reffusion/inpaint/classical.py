@@ -16,7 +16,7 @@ import torch.nn.functional as F
 
 SIZE_MULTIPLE = 8  # px: LaMa halves an image three times
 FSR_SIDE = 160  # px, longer side to which images are reduced for FSR: larger ones take longer and get no sharper
-TELEA_RADIUS = 5  # px, radius around each pixel from which Telea's method takes colours
+TELEA_RADIUS = 5  # px, radius around each pixel from which Telea's method takes colors
 
 
 @dataclass(frozen=True)
@@ -123,5 +123,5 @@ def blank_hole(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
 
 
 def paste_hole(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return a new array [H, W, 3], the colours of `painted` inside the hole, bool [H, W], and of `image` outside."""
+    """Return a new array [H, W, 3], the colors of `painted` inside the hole, bool [H, W], and of `image` outside."""
     return np.where(hole[..., None], painted, image)

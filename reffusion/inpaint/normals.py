@@ -1,4 +1,4 @@
-"""Averaged surface normals from depth maps. They distinguish a tree's bark from ground of the same colour."""
+"""Averaged surface normals from depth maps. They distinguish a tree's bark from ground of the same color."""
 
 from __future__ import annotations
 

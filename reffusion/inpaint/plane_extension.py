@@ -44,7 +44,7 @@ DISK, THICKNESS, OPACITY = 0.45, 0.02, 0.98  # standard deviations of the disks 
 
 
 class _View(NamedTuple):
-    """A rendered training view: camera, depth [H, W] (0 where unknown), unit normals and colours [H, W, 3]."""
+    """A rendered training view: camera, depth [H, W] (0 where unknown), unit normals and colors [H, W, 3]."""
 
     camera: Camera
     depth: np.ndarray
@@ -106,7 +106,7 @@ def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0
         seed: seed of the search for planes and patches.
 
     Returns:
-        Thin disks of one colour each, none if no plane reaches the border of the capture.
+        Thin disks of one color each, none if no plane reaches the border of the capture.
     """
     extension = gaussians.map(lambda p: p[:0].float().cpu())
     views = [_render(gaussians, camera) for camera in cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))]]
@@ -206,7 +206,7 @@ def _empty_map(normal: np.ndarray, offset: float, points: np.ndarray, pixel_size
 
 
 def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Camera]) -> _PlaneMap:
-    """Return the map with its seen cells and their colours, from `views`, and its cells in the frames of `cameras`."""
+    """Return the map with its seen cells and their colors, from `views`, and its cells in the frames of `cameras`."""
     shape, normal = plane_map.seen.shape, plane_map.normal
     points = plane_map.centers.reshape(-1, 3)
     in_frame, near_frame = np.zeros((2, len(points)), bool)
@@ -227,7 +227,7 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
 
 
 def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which points of a plane more views show than see through, and their colours in the best view."""
+    """Return which points of a plane more views show than see through, and their colors in the best view."""
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
@@ -278,7 +278,7 @@ def _visible_target(plane_map: _PlaneMap, others: Sequence[_PlaneMap], viewpoint
 
 
 def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
-    """Return [n, 3] in [0, 1], the colours of the n target cells, made of patches of the seen cells."""
+    """Return [n, 3] in [0, 1], the colors of the n target cells, made of patches of the seen cells."""
     nearest = ndimage.distance_transform_edt(~plane_map.seen, return_distances=False, return_indices=True)
     image = (255 * plane_map.color[tuple(nearest)]).round().astype(np.uint8)  # the cells around must not be black
     source = without_geometry(image, ~plane_map.seen)
@@ -286,7 +286,7 @@ def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _make_disks(plane_map: _PlaneMap, target: np.ndarray, colors: np.ndarray, like: Gaussians) -> Gaussians:
-    """Return one disk for each of the n target cells, with the colours [n, 3] and as many harmonics as `like` has."""
+    """Return one disk for each of the n target cells, with the colors [n, 3] and as many harmonics as `like` has."""
     count = len(colors)
     sh = np.zeros((count, like.sh.shape[1], 3))
     sh[:, 0] = (colors - 0.5) / SH0

@@ -1,6 +1,6 @@
 """Blending of pieces without seams, by the screened Poisson equation.
 
-The result is the picture whose gradients are nearest to those of the pieces, and whose colours are near to theirs.
+The result is the picture whose gradients are nearest to those of the pieces, and whose colors are near to theirs.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-COLOR_WEIGHT = 0.02  # weight of the pieces' colours; gradients have weight 1. Far from the border the colours win.
-TINY_WEIGHT = 1e-9  # weight of colours with which a hole without known neighbours becomes zero, instead of singular
+COLOR_WEIGHT = 0.02  # weight of the pieces' colors; gradients have weight 1. Far from the border the colors win.
+TINY_WEIGHT = 1e-9  # weight of colors with which a hole without known neighbors becomes zero, instead of singular
 
 
 def blend(
@@ -22,19 +22,19 @@ def blend(
     beside: np.ndarray | None = None,
     color_weight: float = COLOR_WEIGHT,
 ) -> np.ndarray:
-    """Compute the blended colours of a hole (Perez et al. 2003).
+    """Compute the blended colors of a hole (Perez et al. 2003).
 
     Args:
         known: [H, W, 3], the picture outside the hole, which the hole must join without a seam.
         hole: bool [H, W], the N pixels to compute.
         right, below: [H, W, 3], the desired difference from each pixel to the next one on the right, and below.
-        own: [H, W, 3], the desired colours.
+        own: [H, W, 3], the desired colors.
         beside: bool [H, W], the pixels outside the hole that the hole must join; None for all.
-        color_weight: weight of the squared deviation from the desired colours, if that of the squared deviation from
+        color_weight: weight of the squared deviation from the desired colors, if that of the squared deviation from
             the desired differences is 1.
 
     Returns:
-        [N, 3] float64, the colours of the hole's pixels in row-major order.
+        [N, 3] float64, the colors of the hole's pixels in row-major order.
     """
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)

@@ -13,8 +13,8 @@ class SourceImage:
 
     Attributes:
         image: [H, W, 3] uint8.
-        masked: bool [H, W], True for pixels whose colours must not be used.
-        usable: bool [H, W], True for pixels at which a patch may have its centre.
+        masked: bool [H, W], True for pixels whose colors must not be used.
+        usable: bool [H, W], True for pixels at which a patch may have its center.
         plane: int [H, W], index of the plane that the pixel shows, 1, 2, ...; 0 for none.
         to_plane: [H, W, 2, 2], derivative of the coordinates on the plane with respect to the pixel (x, y); any regular
             matrix for pixels on no plane.

@@ -33,7 +33,7 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
     """Write Gaussians as a compressed .ply in the scene's own frame.
 
     The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantisation is fine. The x, y
-    and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colours, opacity and spherical harmonics keep 8
+    and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colors, opacity and spherical harmonics keep 8
     bits.
 
     Args:

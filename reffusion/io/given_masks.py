@@ -16,7 +16,7 @@ from reffusion.io.arrays import load_array
 from reffusion.io.files import BadInput, as_bad_input, check_pixels
 from reffusion.io.images import image_size, open_image, resize_nearest
 
-DARK, LIGHT = 8, 200  # brightness up to which an area counts as background, and from which as a light grey
+DARK, LIGHT = 8, 200  # brightness up to which an area counts as background, and from which as a light gray
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 SAMPLES = 500_000  # number of pixels from which the levels of a mask are estimated
 SLACK = 0.1  # of the difference of two levels: a pixel that is this close to a level has it
@@ -34,7 +34,7 @@ class MaskValues:
     """The pixel values of a mask file that mark the object.
 
     Attributes:
-        ids: grey levels, entries of a palette, or categories of a COCO file that mark the object. If empty, white
+        ids: gray levels, entries of a palette, or categories of a COCO file that mark the object. If empty, white
             pixels mark it, as `load_given_mask` describes.
         inverted: True if the object is all other pixels instead.
     """
@@ -61,7 +61,7 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
 
     A mask is one of these:
 
-    - a picture with two levels: {0, 1}, {0, 255}, one bit per pixel, a palette or one colour on black, of 8 or 16 bits
+    - a picture with two levels: {0, 1}, {0, 255}, one bit per pixel, a palette or one color on black, of 8 or 16 bits
       or floats. The threshold lies between the two levels, so lossy compression and soft edges do not matter;
     - a photograph whose alpha varies: opaque pixels are the object. In other pictures transparent pixels are not;
     - a photograph cut out on black, if more than half of it is black: every pixel but black is the object;
@@ -69,13 +69,13 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
     - an array, [H, W] or [1, H, W].
 
     Args:
-        size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
+        size: (height, width) to which the mask is resized by nearest neighbor; None keeps the file's size.
         values: which pixel values mark the object.
 
     Raises:
-        BadInput: the file is unreadable, or has colours while `values` has `ids`. Without `ids`: the file is another
-            photograph; its alpha varies and its colours do not, because tools disagree whether transparent or opaque
-            pixels are the object; it has areas of several values or colours (such as numbers of objects); or its levels
+        BadInput: the file is unreadable, or has colors while `values` has `ids`. Without `ids`: the file is another
+            photograph; its alpha varies and its colors do not, because tools disagree whether transparent or opaque
+            pixels are the object; it has areas of several values or colors (such as numbers of objects); or its levels
             are too dark to tell. The message names the file.
     """
     if is_annotation(path):
@@ -103,7 +103,7 @@ def _load_array(path: Path) -> np.ndarray:
 
 
 def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np.ndarray:
-    """Return the pixels, bool [H, W], whose grey level or palette entry is one of `ids`; raises BadInput on colours."""
+    """Return the pixels, bool [H, W], whose gray level or palette entry is one of `ids`; raises BadInput on colors."""
     array = np.array(image)
     opaque: np.ndarray | bool = True
     if image.mode in ("RGBA", "LA"):
@@ -116,7 +116,7 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
 
 
 def _find_marked_pixels(path: Path, image: Image.Image) -> np.ndarray:
-    """Return the pixels, bool [H, W], that a picture's alpha or colours mark; raises BadInput as `load_given_mask`."""
+    """Return the pixels, bool [H, W], that a picture's alpha or colors mark; raises BadInput as `load_given_mask`."""
     lossless, palette = image.format != "JPEG", image.mode in ("P", "PA")
     if image.mode[0] in "IF" or not image.has_transparency_data:
         array = np.array(image if image.mode[0] in "IF1L" and image.mode != "LAB" else image.convert("RGB"))
@@ -133,7 +133,7 @@ def _find_marked_pixels(path: Path, image: Image.Image) -> np.ndarray:
 
 
 def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
-    """Return whether the opaque pixels of a picture, [N, 3], are of one colour, or black and one colour."""
+    """Return whether the opaque pixels of a picture, [N, 3], are of one color, or black and one color."""
     if np.ptp(colors, axis=0).max() <= 2 * DARK:
         return True
     some = colors[:: -(-len(colors) // SAMPLES)]
@@ -142,8 +142,8 @@ def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
 
 
 def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool = False) -> np.ndarray:
-    """Return the pixels, bool [H, W], that colours mark; raises BadInput for several objects or a photograph."""
-    # `colors` is [H, W, C] of any type, C = 1 or 3. The colours of a JPEG (not `lossless`) are not exact. The entries
+    """Return the pixels, bool [H, W], that colors mark; raises BadInput for several objects or a photograph."""
+    # `colors` is [H, W, C] of any type, C = 1 or 3. The colors of a JPEG (not `lossless`) are not exact. The entries
     # of a palette may be named as `masks: {id: ...}`.
     colors = colors.astype(np.uint8) if colors.dtype == bool else colors
     is_gray = all((colors[..., :1] == colors[..., k : k + 1]).all() for k in range(1, colors.shape[2]))
@@ -180,7 +180,7 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
 
 
 def _brightness(colors: np.ndarray) -> np.ndarray:
-    """Return the largest channel of colours [H, W, C], as [H, W]. `max` over a short last axis is ten times slower."""
+    """Return the largest channel of colors [H, W, C], as [H, W]. `max` over a short last axis is ten times slower."""
     return (
         colors[..., 0]
         if colors.shape[2] == 1
@@ -189,7 +189,7 @@ def _brightness(colors: np.ndarray) -> np.ndarray:
 
 
 def _scale_of(colors: np.ndarray) -> np.float32 | np.uint8:
-    """Return the factor to [0, 255] of colours in [0, 1], [0, 255] or 16 bits, which their maximum tells."""
+    """Return the factor to [0, 255] of colors in [0, 1], [0, 255] or 16 bits, which their maximum tells."""
     top = np.nanmax(colors)
     if top <= 1:
         return np.float32(255) if colors.dtype.kind == "f" else np.uint8(255)
@@ -197,13 +197,13 @@ def _scale_of(colors: np.ndarray) -> np.float32 | np.uint8:
 
 
 def _sample(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return about `SAMPLES` pixels [N, C] of colours [H, W, C], evenly spaced, and which are even, bool [N]."""
+    """Return about `SAMPLES` pixels [N, C] of colors [H, W, C], evenly spaced, and which are even, bool [N]."""
     every = int(np.ceil((colors.shape[0] * colors.shape[1] / SAMPLES) ** 0.5))
     if every == 1:  # a small picture, of which borders count too
         colors = np.pad(colors, ((1, 0), (1, 0), (0, 0)), mode="edge")
     here, before = slice(1, None, every), slice(0, -1, every)
     some = colors[here, here]
-    # An even pixel has the same colour as its upper, left and upper left neighbours.
+    # An even pixel has the same color as its upper, left and upper left neighbors.
     even = np.all([(some == colors[r, c]).all(2) for r, c in ((before, here), (here, before), (before, before))], 0)
     return some.reshape(-1, colors.shape[2]), even.ravel()
 
@@ -247,12 +247,12 @@ def _find_levels(colors: np.ndarray, even: np.ndarray, lossless: bool) -> _Level
     has_high = np.abs(brightness - high) <= slack
     color = np.median(colors[has_high], axis=0)
     is_gray = np.ptp(color) <= 4
-    # JPEG keeps grey exactly, but halves the resolution of hues.
+    # JPEG keeps gray exactly, but halves the resolution of hues.
     tolerance = 4 if lossless or is_gray else 40
     other_hue = np.abs(colors[above] - brightness[above, None] * (color / color.max())).max(1) > tolerance
     share = float((has_low | has_high).mean())
     is_thin = is_gray and high >= LIGHT and share >= THIN and has_high[above].mean() >= THIN_HIGH
-    # The upper level of a grey picture that reaches a light grey is its maximum instead, because soft edges may be
+    # The upper level of a gray picture that reaches a light gray is its maximum instead, because soft edges may be
     # wider than what they surround.
     if is_gray and top >= LIGHT:
         high, has_high = top, top - brightness <= slack

@@ -155,8 +155,8 @@ def _orientation(image: Image.Image) -> int:
 def load_image(path: Path, upright: bool = False) -> np.ndarray:
     """Read a picture as uint8 [H, W, 3], sRGB.
 
-    Grey becomes RGB, and 16-bit grey levels are divided by 257. A picture with transparent pixels is shown over black:
-    its colours are multiplied by alpha, so that colours which nobody sees have no effect. Black is what Gaussians are
+    Gray becomes RGB, and 16-bit gray levels are divided by 257. A picture with transparent pixels is shown over black:
+    its colors are multiplied by alpha, so that colors which nobody sees have no effect. Black is what Gaussians are
     rendered over, as in 3DGS; pixels without supervision would need a mask in every stage that compares pictures.
 
     Args:
@@ -277,7 +277,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     Masks that a user made are read by `reffusion.io.given_masks`.
 
     Args:
-        size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
+        size: (height, width) to which the mask is resized by nearest neighbor; None keeps the file's size.
 
     Raises:
         BadInput: the file is unreadable, or has other values than 0 and 255; the message names it.
@@ -308,9 +308,9 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize an array [H, W, ...] to [*size, ...] by nearest neighbour.
+    """Resize an array [H, W, ...] to [*size, ...] by nearest neighbor.
 
-    Each new pixel takes the value of the old pixel that contains the new pixel's centre.
+    Each new pixel takes the value of the old pixel that contains the new pixel's center.
 
     Args:
         size: (height, width).

@@ -1,4 +1,4 @@
-"""Reading and writing of Gaussians (PLY of 3DGS and other formats), and of coloured points as PLY."""
+"""Reading and writing of Gaussians (PLY of 3DGS and other formats), and of colored points as PLY."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cp
 
 
 def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a point cloud as PLY: positions [P, 3] as doubles, and colours [P, 3] uint8."""
+    """Write a point cloud as PLY: positions [P, 3] as doubles, and colors [P, 3] uint8."""
     types = [(name, "f8") for name in POSITION] + [(name, "u1") for name in RED_GREEN_BLUE]
     table = np.empty(len(points), dtype=types)
     for names, values in ((POSITION, points), (RED_GREEN_BLUE, colors)):
@@ -154,7 +154,7 @@ def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         positions: [P, 3] float64.
-        colours: [P, 3] uint8; mid grey if the file has no colours red, green and blue.
+        colors: [P, 3] uint8; mid gray if the file has no colors red, green and blue.
 
     Raises:
         BadInput: the file is unreadable, or its vertices have no x, y, z.

@@ -1,7 +1,7 @@
 """Reading and writing of .splat files, the format of antimatter15's viewer: 32 bytes per splat, without a header.
 
-A record holds the position as three float32, the size as three float32 (standard deviations, not logarithms), colour
-and opacity in four bytes, and the quaternion wxyz in four bytes. There are no spherical harmonics beyond the colour. No
+A record holds the position as three float32, the size as three float32 (standard deviations, not logarithms), color
+and opacity in four bytes, and the quaternion wxyz in four bytes. There are no spherical harmonics beyond the color. No
 maintained library reads this format without a compiler or the network.
 """
 

@@ -98,7 +98,7 @@ class Repairs:
 def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
     """Drop invalid rows, and clamp extreme opacities and scales to finite values that look the same.
 
-    A row is dropped if it has a NaN, an infinite position, rotation or colour, or a log-scale of `MOST_SCALE` or more,
+    A row is dropped if it has a NaN, an infinite position, rotation or color, or a log-scale of `MOST_SCALE` or more,
     or if all its values are zero. A row whose only zero parameter is the quaternion is kept, because 3DGS renders a
     zero quaternion as the identity.
 

@@ -230,7 +230,7 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
 
 
 def _color_coefficients(block: np.ndarray) -> np.ndarray:
-    """Return the constant spherical harmonic, float32 [N, 3], of colours that are bytes, or floats in [0, 1]."""
+    """Return the constant spherical harmonic, float32 [N, 3], of colors that are bytes, or floats in [0, 1]."""
     colors = np.stack([block[name] for name in RED_GREEN_BLUE], axis=1)
     unit = colors if np.issubdtype(colors.dtype, np.floating) else colors / 255
     return ((unit - 0.5) / SH0).astype(np.float32)

@@ -14,9 +14,9 @@ from reffusion.splat import rasterizer
 from reffusion.splat.pure_torch import colors
 from reffusion.types import Gaussians
 
-COLOR_MARGIN = 10.0  # levels of 255: a colour differs if it is further outside the range of colours around the pixel
+COLOR_MARGIN = 10.0  # levels of 255: a color differs if it is further outside the range of colors around the pixel
 ROUGH = 1.05  # ratio of farthest to nearest depth around a point above which the surface is rough
-MISMATCH_SHARE = 0.5  # a Gaussian is debris if its colour differs in a larger share of the views that see it
+MISMATCH_SHARE = 0.5  # a Gaussian is debris if its color differs in a larger share of the views that see it
 
 
 @torch.no_grad()
@@ -33,7 +33,7 @@ def find_debris(
     meets two conditions. First, its blending weight in masked pixels, rendered without the object, exceeds 0.5 px in
     all views together, and also exceeds its blending weight in unmasked pixels, rendered with the object. Second, the
     number of views that show a surface at the Gaussian does not exceed the number of views that see past the Gaussian,
-    or most of the views that show a surface there show a rough surface of another colour. A Gaussian that no view can
+    or most of the views that show a surface there show a rough surface of another color. A Gaussian that no view can
     check meets the second condition, too.
 
     Args:
@@ -67,9 +67,9 @@ def find_debris(
 def count_color_mismatches(
     gaussians: Gaussians, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Return int64 [N], for each Gaussian the number of views that show a rough surface of another colour there.
+    """Return int64 [N], for each Gaussian the number of views that show a rough surface of another color there.
 
-    Smooth surfaces do not count: a Gaussian on a smooth surface is confirmed by its position, and its colour may be
+    Smooth surfaces do not count: a Gaussian on a smooth surface is confirmed by its position, and its color may be
     view-dependent.
 
     Args:

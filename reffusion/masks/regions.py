@@ -76,7 +76,7 @@ def silhouette(region: Region, camera: Camera, disparity: np.ndarray) -> np.ndar
 def outside_sphere(center: np.ndarray, radius: float, camera: Camera) -> np.ndarray:
     """Return bool [H, W], the pixels whose rays miss a sphere (the paper's inverse masks, section 5.4).
 
-    A ray starts at the camera's centre, so all rays miss a sphere behind the camera.
+    A ray starts at the camera's center, so all rays miss a sphere behind the camera.
 
     Args:
         center: [3], in world coordinates.
@@ -86,7 +86,7 @@ def outside_sphere(center: np.ndarray, radius: float, camera: Camera) -> np.ndar
 
 
 def point_on_axis(camera: Camera, distance: float) -> np.ndarray:
-    """Return [3], the world point on the camera's optical axis at this distance in front of the camera's centre."""
+    """Return [3], the world point on the camera's optical axis at this distance in front of the camera's center."""
     return camera.center + distance * camera.world_to_camera[2, :3]
 
 

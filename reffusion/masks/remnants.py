@@ -1,9 +1,9 @@
 """Remnants: parts of the object that the masks leave out, and that would stay in the scene when the object is removed.
 
-Such a part touches the object more than it touches the surroundings, and its colours resemble those of the object more
-than those of the surroundings. A minimum cut through the graph of neighbouring Gaussians proposes parts. A part is
+Such a part touches the object more than it touches the surroundings, and its colors resemble those of the object more
+than those of the surroundings. A minimum cut through the graph of neighboring Gaussians proposes parts. A part is
 selected by its score, the sum of the logarithms of two ratios: contact with the object to contact with the rest, and
-density of its colours in the object to their density in the surroundings.
+density of its colors in the object to their density in the surroundings.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from reffusion.gaussians.neighbours import find_neighbours, measure_overlap
+from reffusion.gaussians.neighbors import find_neighbors, measure_overlap
 from reffusion.graph_cut import HARD, min_cut
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
@@ -31,10 +31,10 @@ REACH = 1.0  # in radii of the object: Gaussians farther from the object than th
 SURROUNDINGS = 3.0
 ATTACHMENT = 2.0  # in the cut, contact with the object is divided by this
 LEAST_SIMILARITY = 0.3  # least similarity of two unlabelled Gaussians in the cut, so that a pattern divides no surface
-COLOR_WEIGHT = 0.3  # weight of the log-ratio of colour densities in the cut; in the score its weight is 1
+COLOR_WEIGHT = 0.3  # weight of the log-ratio of color densities in the cut; in the score its weight is 1
 LARGEST_LOG_RATIO = 3.0  # limit of the absolute value of this log-ratio
-SAMPLES, NEAREST = 2000, 10  # density of a colour: from the distance to the NEAREST-th of up to SAMPLES random colours
-COLOR_BLUR = 0.02  # added to the distances of colours in [0, 1], so that smaller differences hardly count
+SAMPLES, NEAREST = 2000, 10  # density of a color: from the distance to the NEAREST-th of up to SAMPLES random colors
+COLOR_BLUR = 0.02  # added to the distances of colors in [0, 1], so that smaller differences hardly count
 LEAST_SCORE = 2.5  # score from which a part is a remnant
 LEAST_COUNT = 10  # least number of Gaussians of a remnant
 # Least number of a remnant's visible pixels, relative to those of the object. Parts that would float stand out more.
@@ -141,7 +141,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     near = np.flatnonzero(distance <= max(SURROUNDINGS * radius, beyond[min(SAMPLES, len(beyond)) - 1]))
     local, opacities = gaussians.map(lambda p: p[torch.as_tensor(near, device=p.device)]), opacities[near]
     inside, stays, solid = labels[near], distance[near] > REACH * radius, opacities > SOLID
-    graph, size = find_neighbours(local), surface_sizes(local)
+    graph, size = find_neighbors(local), surface_sizes(local)
     first, second = graph.pairs.T
     overlap = measure_overlap(local, graph.pairs)
     contact = overlap * np.minimum(*opacities[graph.pairs.T]) * np.minimum(*size[graph.pairs.T])
@@ -171,14 +171,14 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
 
 
 def compare_densities(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """Return [N], for each colour the natural logarithm of its density inside divided by its density outside.
+    """Return [N], for each color the natural logarithm of its density inside divided by its density outside.
 
-    Densities are those of colours in colour space, estimated from the distance to the `NEAREST`-th nearest sample.
+    Densities are those of colors in color space, estimated from the distance to the `NEAREST`-th nearest sample.
 
     Args:
         colors: [N, 3].
-        inside: bool [N], True for the colours of one side; at least `NEAREST` are True.
-        outside: bool [N], True for the colours of the other side; at least `NEAREST` are True.
+        inside: bool [N], True for the colors of one side; at least `NEAREST` are True.
+        outside: bool [N], True for the colors of the other side; at least `NEAREST` are True.
     """
     generator, densities = np.random.default_rng(0), []
     for side in (inside, outside):

@@ -35,7 +35,7 @@ ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are removed
 def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
     """Return how much a picture differs from its photograph where both show the same, in levels of 255.
 
-    The difference of a pixel is that of the colour channel that differs most, after a slight blur. If an autoencoder
+    The difference of a pixel is that of the color channel that differs most, after a slight blur. If an autoencoder
     redrew the picture, its texture differs from that of the photograph everywhere. The result is a high quantile
     (`REDRAWN_QUANTILE`) of these differences, so smaller differences do not mean that a pixel was repainted.
 
@@ -104,7 +104,7 @@ def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) ->
 def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Return float32 [H, W, 3], the natural logarithm of the completed view's brightness divided by the photograph's.
 
-    Each colour channel has its own ratio. The pictures are blurred first. The arguments are those of `detect_shadows`.
+    Each color channel has its own ratio. The pictures are blurred first. The arguments are those of `detect_shadows`.
     """
     sigma = morphology.to_pixels(BLUR, view.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) + DARK_OFFSET

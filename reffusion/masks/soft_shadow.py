@@ -1,10 +1,10 @@
 """Detection and removal of the object's soft shadow, where no reference shows the scene without it.
 
 A shadow changes the light smoothly, whatever the texture below it, whereas borders of materials are sharp. The light is
-therefore estimated on the plane on which the object stands: a smooth function whose differences between neighbouring
+therefore estimated on the plane on which the object stands: a smooth function whose differences between neighboring
 cells follow those of the logarithmic brightness in most cells, but not across sharp borders. The dark region of this
 function is taken for the object's shadow only if it lies beside the object, is surrounded by lit cells, and darkens
-all colours about equally. Weak shadows are left as they are, because a stain looks the same.
+all colors about equally. Weak shadows are left as they are, because a stain looks the same.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class SoftShadow:
         cell_size: side of a cell, in world units.
         fade: [2] heights over the plane in world units; up to the first the shadow is complete, from the second none.
         log_light: [CELLS, CELLS], logarithm of the brightness relative to that without the shadow, at most 0.
-        tint: [3], the log light of each colour channel divided by `log_light`.
+        tint: [3], the log light of each color channel divided by `log_light`.
     """
 
     normal: np.ndarray
@@ -80,7 +80,7 @@ class SoftShadow:
     tint: np.ndarray
 
     def log_light_at(self, points: np.ndarray) -> np.ndarray:
-        """Return [P, 3], the log light of each colour channel at world points [P, 3]; 0 outside the shadow."""
+        """Return [P, 3], the log light of each color channel at world points [P, 3]; 0 outside the shadow."""
         offset = points - self.center
         at = offset @ self.axes.T / self.cell_size + (CELLS - 1) / 2
         on_plane = ndimage.map_coordinates(self.log_light, at.T, order=1, mode="constant", cval=0.0)
@@ -102,7 +102,7 @@ class SoftShadow:
         return relight(photo, light)
 
     def remove_from_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with the colours that they have without the shadow."""
+        """Return the Gaussians with the colors that they have without the shadow."""
         light = self.log_light_at(gaussians.means.detach().double().cpu().numpy())
         gain = torch.from_numpy(np.exp(-light)).to(gaussians.sh)[:, None, :]
         offset = DARK_OFFSET / 255
@@ -190,7 +190,7 @@ def _map_index(points: np.ndarray, background: Background, plane: Plane) -> np.n
 def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, clip: float) -> np.ndarray:
     """Return [CELLS, CELLS, 3], the smooth log light of each channel; 0 where unseen."""
     # The light L minimises sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
-    # difference of neighbouring cells and d2 the second difference. The weights a keep L at 0 far from the object.
+    # difference of neighboring cells and d2 the second difference. The weights a keep L at 0 far from the object.
     light = np.zeros((CELLS, CELLS, 3))
     number = np.where(seen, np.cumsum(seen).reshape(seen.shape) - 1, -1)
     first = sparse.vstack([_difference(number, [[-1.0], [1.0]]), _difference(number, [[-1.0, 1.0]])]).tocsr()
@@ -250,7 +250,7 @@ def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
 def _make_shadow(
     background: Background, plane: Plane, brightness: np.ndarray, seen: np.ndarray, region: np.ndarray
 ) -> SoftShadow:
-    """Return the shadow of the given region: the soft light there, and the colours of the region."""
+    """Return the shadow of the given region: the soft light there, and the colors of the region."""
     soft = _smooth_light(brightness, seen, *SOFT)
     tint = soft[region].mean(0)
     mean = GAIN * np.minimum(soft.mean(2), 0)

@@ -1,4 +1,4 @@
-"""Multi-view consistency: how much the colours of the same surface points differ in two rendered views."""
+"""Multi-view consistency: how much the colors of the same surface points differ in two rendered views."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RenderedView(NamedTuple):
         picture: uint8 [H, W, 3], the rendering.
         depth: [H, W], camera z; 0 where alpha is too low for a depth.
         mask: bool [H, W], True = the pixel is compared.
-        exposure: [3, 4], the affine colour map that was applied to the Gaussians' colours in the picture (see
+        exposure: [3, 4], the affine color map that was applied to the Gaussians' colors in the picture (see
             `fit.exposure`); None if none was applied.
     """
 
@@ -50,7 +50,7 @@ class RenderedView(NamedTuple):
 
 
 def reprojected_color_difference(first: RenderedView, second: RenderedView) -> tuple[float | None, float | None]:
-    """Compare the colours of the masked pixels of `first` with the colours of the same surface points in `second`.
+    """Compare the colors of the masked pixels of `first` with the colors of the same surface points in `second`.
 
     The pixels are unprojected by the depth of `first` and projected into `second`. Pixels without a depth, and points
     outside the frame of `second`, are not compared. A point that lies farther behind the surface of `second` than the
@@ -58,7 +58,7 @@ def reprojected_color_difference(first: RenderedView, second: RenderedView) -> t
     compared. The mask of `second` is not used.
 
     Returns:
-        The mean absolute difference over pixels and channels (colours in [0, 1], exposures undone), and the share in
+        The mean absolute difference over pixels and channels (colors in [0, 1], exposures undone), and the share in
         [0, 1] of the mask's pixels that were compared. Both are None if the mask is empty. The difference is None and
         the share 0 if no pixel can be compared.
     """

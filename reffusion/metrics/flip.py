@@ -17,7 +17,7 @@ PIXELS_PER_DEGREE = 67.0  # FLIP's own default: 0.7 m away from a 0.7 m wide 4K 
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 EDGE_WIDTH = 0.082  # degrees, width of the edges and points that are detected
 COLOR_POWER, FEATURE_POWER = 0.7, 0.5  # exponents q_c and q_f of the paper
-# (p_c, p_t) of the paper: colour differences up to the share p_c of the largest one are mapped to [0, p_t].
+# (p_c, p_t) of the paper: color differences up to the share p_c of the largest one are mapped to [0, p_t].
 KNEE = (0.4, 0.95)
 
 TO_XYZ = np.array(
@@ -45,14 +45,14 @@ def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _srgb_to_ycxcz(picture: np.ndarray) -> np.ndarray:
-    """Convert sRGB [H, W, 3] in [0, 1] to the opponent colours YCxCz, float32 [H, W, 3]."""
+    """Convert sRGB [H, W, 3] in [0, 1] to the opponent colors YCxCz, float32 [H, W, 3]."""
     linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4).astype(np.float32)
     x, y, z = np.moveaxis(_apply_matrix(linear, TO_XYZ / WHITE[:, None]), 2, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], 2)
 
 
 def _apply_matrix(picture: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Multiply each colour of a picture [H, W, 3] by a [3, 3] matrix, in float32."""
+    """Multiply each color of a picture [H, W, 3] by a [3, 3] matrix, in float32."""
     return picture @ matrix.T.astype(np.float32)
 
 
@@ -90,19 +90,19 @@ def _linear_to_lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _apply_hunt_effect(lab: np.ndarray) -> np.ndarray:
-    """Scale the chroma of CIELAB colours [H, W, 3] by the lightness, because the eye sees less colour in the dark."""
+    """Scale the chroma of CIELAB colors [H, W, 3] by the lightness, because the eye sees less color in the dark."""
     return lab * np.concatenate([np.ones_like(lab[..., :1]), 0.01 * lab[..., :1], 0.01 * lab[..., :1]], 2)
 
 
 def _hyab_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the HyAB distance [H, W] of CIELAB colours: |lightness difference| + Euclidean distance in chroma."""
+    """Return the HyAB distance [H, W] of CIELAB colors: |lightness difference| + Euclidean distance in chroma."""
     apart = first - second
     return np.abs(apart[..., 0]) + np.hypot(apart[..., 1], apart[..., 2])
 
 
 @functools.cache
 def _max_color_difference() -> float:
-    """Return the largest colour difference, that between pure green and pure blue, raised to `COLOR_POWER`."""
+    """Return the largest color difference, that between pure green and pure blue, raised to `COLOR_POWER`."""
     green, blue = (
         _apply_hunt_effect(_linear_to_lab(np.array([[color]], np.float32))) for color in ((0, 1, 0), (0, 0, 1))
     )
@@ -110,7 +110,7 @@ def _max_color_difference() -> float:
 
 
 def _redistribute(error: np.ndarray) -> np.ndarray:
-    """Map colour differences [H, W] to [0, 1] by a piecewise linear function with a knee at `KNEE`."""
+    """Map color differences [H, W] to [0, 1] by a piecewise linear function with a knee at `KNEE`."""
     largest, (knee, share) = _max_color_difference(), KNEE
     below = error * (share / (knee * largest))
     above = share + (error - knee * largest) / ((1 - knee) * largest) * (1 - share)

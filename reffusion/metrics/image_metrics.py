@@ -256,7 +256,7 @@ def score_outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dic
 
     Returns:
         Name -> value. All are None if the mask covers the image. "ssim_outside" is None if no window of 11 x 11 px
-        inside the image has its centre outside the mask.
+        inside the image has its center outside the mask.
     """
     kept = ~mask
     if not kept.any():

@@ -151,7 +151,7 @@ def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Summarise the multi-view consistency over the pairs of consecutive views.
 
     Returns:
-        "consistency", the colour difference (0 = consistent), and "consistency_share", the share of the mask's pixels
+        "consistency", the color difference (0 = consistent), and "consistency_share", the share of the mask's pixels
         that were compared: means over the pairs that have a value. "pairs": number of pairs that
         could be compared. "protocol": description of the measurement.
     """

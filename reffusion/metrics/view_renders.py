@@ -39,7 +39,7 @@ class ViewRenderer:
         gaussians: name of a stage -> Gaussians; it contains "fit".
         result: name of the stage whose Gaussians are the resulting scene.
         painter: 2D inpainter that fills the mask in the renderings of the resulting scene; None for no 2D inpainting.
-        exposures: view -> affine colour map [3, 4] (see `fit.exposure`); empty if no exposures were fitted.
+        exposures: view -> affine color map [3, 4] (see `fit.exposure`); empty if no exposures were fitted.
     """
 
     gaussians: dict[str, Gaussians]
@@ -70,7 +70,7 @@ class ViewRenderer:
         return ViewRenders(by_stage, RenderedView(camera, picture, depth, mask, matrix))
 
     def _view_exposure(self, camera: Camera, mask: np.ndarray, photo: np.ndarray | None) -> np.ndarray | None:
-        """Return the view's affine colour map [3, 4], adjusted to the photograph outside the mask if there is one."""
+        """Return the view's affine color map [3, 4], adjusted to the photograph outside the mask if there is one."""
         # None without an entry in `exposures`; see `exposure.PROTOCOL`.
         matrix = self.exposures.get(camera.name)
         if matrix is None or photo is None:
@@ -82,7 +82,7 @@ class ViewRenderer:
 
 
 def _render(gaussians: Gaussians, camera: Camera, matrix: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Render a view, uint8 [H, W, 3], and its camera z, float64 [H, W]; raises ValueError if a colour is not finite."""
+    """Render a view, uint8 [H, W, 3], and its camera z, float64 [H, W]; raises ValueError if a color is not finite."""
     rendered = rasterizer.render(gaussians, camera)
     # `matrix` [3, 4] is the exposure to apply, or None.
     color = exposure.apply_exposure(rendered.color, matrix).clamp(0, 1).cpu().numpy()

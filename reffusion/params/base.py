@@ -136,5 +136,5 @@ class Sampler(Settings):
         gt=0,
         le=1,
         description="initial noise level, as a fraction of the schedule; below 1 the sampler starts from the hole "
-        "filled with the colours around it",
+        "filled with the colors around it",
     )

@@ -82,7 +82,7 @@ class AdversarialTerm(Settings):
         0.0, ge=0, le=1, description="fraction of the run after which the term starts (PAPER leaves open)"
     )
     # PAPER leaves open: its "all spherical harmonics" may mean all coefficients of masked Gaussians, or those of all
-    # Gaussians. The latter can remove the colour differences at the mask's border that the section describes.
+    # Gaussians. The latter can remove the color differences at the mask's border that the section describes.
     reaches: Literal["masked", "all"] = Field(
         "all", description="Gaussians whose spherical harmonics the term moves: masked ones, or all in its patches"
     )

@@ -76,9 +76,9 @@ class Params(Settings):
     init: Init = Init()
     densify: Densify = Densify()
     lr: LearningRates = LearningRates()
-    # PAPER leaves open: the background colour; the default of 3DGS is black. On black, a fit can represent dark texture
+    # PAPER leaves open: the background color; the default of 3DGS is black. On black, a fit can represent dark texture
     # by holes, which later stages would take for places without a surface.
-    random_background: bool = Field(True, description="a random background colour in each step instead of black")
+    random_background: bool = Field(True, description="a random background color in each step instead of black")
     antialiased: bool = Field(False, description="2D filter of Mip-Splatting: same total opacity at any distance")
     exposure: Literal["never", "auto", "always"] = Field(
         "never",

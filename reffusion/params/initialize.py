@@ -40,9 +40,9 @@ class Params(Settings):
         description="remove haze that mostly covers unobserved pixels; add a second surface where other views see past "
         "the new one into nothing",
     )
-    # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
+    # PAPER leaves open: the new Gaussians' view-dependent color. The reference shows one side only.
     view_dependent_color: bool = Field(
-        False, description="view-dependent colours like those of the surfaces around the hole"
+        False, description="view-dependent colors like those of the surfaces around the hole"
     )
     # PAPER leaves open: what the reference's camera does not see of the hole.
     extra_views: int = Field(0, ge=0, description="maximum number of views completed besides the references")

@@ -39,7 +39,7 @@ class Params(Settings):
         0.9,
         ge=0,
         le=1,
-        description="also mask Gaussians whose centre is in C in more than this share of views; 1 = none",
+        description="also mask Gaussians whose center is in C in more than this share of views; 1 = none",
     )
     debris: bool = Field(True, description="also mask Gaussians that the removal uncovers and no photograph supports")
     remnants: bool = Field(

@@ -94,7 +94,7 @@ def measure_levels(prior: Prior, images: Tensor, masks: Tensor) -> levels.Levels
 def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
     """Return the conditioning of the UNet, [mask | latents of the masked image], [B, 1 + C, h, w], without gradient.
 
-    The hole in the masked image is grey, or filled from its surroundings if `prior.fills`.
+    The hole in the masked image is gray, or filled from its surroundings if `prior.fills`.
 
     Args:
         prior: The diffusion prior.

@@ -50,6 +50,6 @@ def _downsample(values: Tensor) -> Tensor:
 
 
 def _neighbor_mean(x: Tensor) -> Tensor:
-    """Return the mean of the four neighbours of each pixel. At borders the pixel itself replaces a missing one."""
+    """Return the mean of the four neighbors of each pixel. At borders the pixel itself replaces a missing one."""
     padded = F.pad(x, (1, 1, 1, 1), mode="replicate")
     return (padded[..., :-2, 1:-1] + padded[..., 2:, 1:-1] + padded[..., 1:-1, :-2] + padded[..., 1:-1, 2:]) / 4

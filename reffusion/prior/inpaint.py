@@ -103,7 +103,7 @@ def paint(
 
     First the whole view is painted at the prior's native size from the noise level `start`. Each finer level
     (`level_sizes`) starts from the enlarged result of the coarser level, and is repainted window by window from the
-    noise level `finest`. A window sees the results of its neighbours. The seeds determine the result.
+    noise level `finest`. A window sees the results of its neighbors. The seeds determine the result.
 
     Args:
         prior: The diffusion prior.
@@ -177,7 +177,7 @@ def paint_coarse_to_fine(
 def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:
     """Repaint the masked pixels of `painted` [B, 3, h, w] in place, window by window of `size` px, by `sample`."""
     remaining = mask[0, 0] > 0
-    # A window sees the results of its neighbours. `sample` gets pictures of a window, `part` [1, 1, size, size] which
+    # A window sees the results of its neighbors. `sample` gets pictures of a window, `part` [1, 1, size, size] which
     # is 1 at the pixels that are used, top and left, and returns new pictures of the window.
     for top, left in windows_over(remaining.cpu(), size):
         window = (..., slice(top, top + size), slice(left, left + size))
@@ -248,9 +248,9 @@ def repaint(
 
 
 def seam_score(candidates: Tensor, hole: Tensor) -> Tensor:
-    """Return [B], the mean absolute colour step across the boundary of the hole; a low value means no visible seam.
+    """Return [B], the mean absolute color step across the boundary of the hole; a low value means no visible seam.
 
-    The mean is over channels and over all pairs of neighbouring pixels of which one is in the hole.
+    The mean is over channels and over all pairs of neighboring pixels of which one is in the hole.
 
     PAPER leaves open: how the reference is chosen (the paper: by eye). Here by default the candidate with the lowest
     value is chosen.

@@ -19,8 +19,8 @@ class Levels(NamedTuple):
     """Brightness and contrast of pictures, relative to those at which a model sees them.
 
     Attributes:
-        mean: [B, 3, 1, 1], the colour that the model sees as 0.
-        gain: [B, 1, 1, 1], the factor by which differences of colour are multiplied for the model.
+        mean: [B, 3, 1, 1], the color that the model sees as 0.
+        gain: [B, 1, 1, 1], the factor by which differences of color are multiplied for the model.
     """
 
     mean: Tensor

@@ -49,7 +49,7 @@ class Prior:
         rows_with_grad: The same for passes with a gradient. Activations of the parts are recomputed in the backward
             pass.
         fills: Whether the hole in the conditioning picture is filled from its surroundings
-            (`harmonic_fill.harmonic_extension`), as conditioning.json may ask. Else the hole is grey, as usual.
+            (`harmonic_fill.harmonic_extension`), as conditioning.json may ask. Else the hole is gray, as usual.
         contrast: Standard deviation of the known pixels of a picture as the model sees it (`levels`), which
             conditioning.json may set. 0, as usual: the model sees the picture as it is.
     """

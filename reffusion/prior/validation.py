@@ -30,7 +30,7 @@ class HeldOut:
         reference: Two samples of the reference with its hole as mask, the whole view and a crop.
         pictures: [1 + B, 3, n, n] in [-1, 1], the whole reference and B photographs.
         repaint: [1 + B, 1, n, n], 1 at the pixels to repaint.
-        holes: [1 + B, 1, n, n], 1 at the pixels to repaint whose true colours are known, i.e. outside the object.
+        holes: [1 + B, 1, n, n], 1 at the pixels to repaint whose true colors are known, i.e. outside the object.
     """
 
     reference: Batch

@@ -10,7 +10,7 @@ from torch import Tensor
 def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
     """Draw a size x size window that shows masked and other pixels, and return its upper left corner (top, left).
 
-    PAPER leaves open: how a patch is sampled from the bounding box of the mask. The centre of the window is a masked
+    PAPER leaves open: how a patch is sampled from the bounding box of the mask. The center of the window is a masked
     pixel, because the box may be mostly unmasked (a ring, two objects). A window that extends beyond the view is moved
     inside. A window that is masked entirely is not drawn, because a prior is not adapted to pictures without any
     known pixel.

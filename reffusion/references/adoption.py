@@ -27,7 +27,7 @@ from reffusion.workspace import Workspace
 # in which they are blended into the photograph.
 PASTE_MARGIN, PASTE_BLEND = 0.01, 0.01
 LEAST_HOLE_SHARE = 0.9  # share of the invent mask that a reference must cover after alignment
-NEIGHBOURS = 4  # nearest views with which a matching reference is compared, in case it shows one of them better
+NEIGHBORS = 4  # nearest views with which a matching reference is compared, in case it shows one of them better
 
 
 def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[list[Reference], dict[str, str]]:
@@ -141,7 +141,7 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
     scene = space.scene
     others = [name for name in scene.train if name != file.view and has_photograph(space.poses, name)]
     others.sort(key=lambda name: view_distance(scene.cameras[name], scene.cameras[file.view]))
-    others = others[:NEIGHBOURS] if found.fits else others
+    others = others[:NEIGHBORS] if found.fits else others
     loaded = ((name, load_photo(space, name), object_pixels(space.mask_sets[name])) for name in others)
     closer = registration.find_better_view(image, found, loaded)
     if found.fits and closer is None:
@@ -157,7 +157,7 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
 def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
     """Raise ValueError if two references contradict each other.
 
-    They do so if their colours differ in the part of the hole that both show (`references.agreement`). Training would
+    They do so if their colors differ in the part of the hole that both show (`references.agreement`). Training would
     average the two.
     """
     if len(references) < 2:
@@ -188,7 +188,7 @@ def object_pixels(masks: MaskSet) -> np.ndarray:
 def view_distance(a: Camera, b: Camera) -> float:
     """Return a measure of how differently two cameras see the scene.
 
-    It is the distance of their centres, in units of the normalised frame, plus the angle between their optical axes, in
+    It is the distance of their centers, in units of the normalised frame, plus the angle between their optical axes, in
     radians.
     """
     cosine = a.world_to_camera[2, :3] @ b.world_to_camera[2, :3]

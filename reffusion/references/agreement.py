@@ -2,8 +2,8 @@
 
 The surface behind the object is not known yet. As in `view_ranking`, the disparity of the surroundings is continued
 across the hole, unless the completed view has a depth map. Therefore a point of one view is found in the other only to
-within a few pixels, and texture cannot be compared. Instead, smoothed colours of one view are compared with the range
-of colours that the other view shows around the same point.
+within a few pixels, and texture cannot be compared. Instead, smoothed colors of one view are compared with the range
+of colors that the other view shows around the same point.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from reffusion.references.view_ranking import Hole
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Reference
 
-# Of the image's width: standard deviation of the smoothing, and radius of the window whose range of colours is taken.
+# Of the image's width: standard deviation of the smoothing, and radius of the window whose range of colors is taken.
 SMOOTH, REACH = 0.02, 0.04
 NEAR = 0.015  # relative difference of depth within which two views show the same surface
 ALIKE = 0.7  # smallest cosine between the normals of the same surface in two views
 LEAST_PIXELS = 40  # pixels, at the size `view_ranking.SIDE`, that both views must show for a pair to be compared
-# Mean difference, colours in [0, 1], from which two pictures contradict each other. On demo-pair true pictures have
+# Mean difference, colors in [0, 1], from which two pictures contradict each other. On demo-pair true pictures have
 # 0.001, one 0.9 times as bright 0.004, one with a smoothly inpainted hole 0.007, one turned upside down 0.021; one 0.7
 # times as bright 0.038, with red and blue exchanged 0.047, mirrored 0.053, with the objects left in 0.089. A chequered
 # box on a real rock: up to 0.03.
@@ -98,10 +98,10 @@ def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hol
 
 
 def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:
-    """Return the mean difference in [0, 1] between the colours of two references, where both show the same surface.
+    """Return the mean difference in [0, 1] between the colors of two references, where both show the same surface.
 
-    At a point in both holes, the difference is how far the smoothed colour of one reference lies outside the range of
-    smoothed colours that the other shows around this point, in the channel in which it lies furthest outside. It is
+    At a point in both holes, the difference is how far the smoothed color of one reference lies outside the range of
+    smoothed colors that the other shows around this point, in the channel in which it lies furthest outside. It is
     averaged over all such points, and over both directions of comparison.
 
     Args:
@@ -118,7 +118,7 @@ def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> 
 
 
 def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:
-    """Return how far the colours of `a` lie outside the range of those of `b`; see `color_difference`."""
+    """Return how far the colors of `a` lie outside the range of those of `b`; see `color_difference`."""
     own = hole_a.pixels & (hole_a.depth > 0)
     points, colors = geometry.unproject(hole_a.depth, hole_a.camera)[own], _smooth_colors(a, hole_a)[own]
     uv, z = geometry.project(points, hole_b.camera)

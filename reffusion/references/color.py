@@ -1,4 +1,4 @@
-"""Colours of a reference: they are matched to those of its photograph, and its hole is pasted into the photograph."""
+"""Colors of a reference: they are matched to those of its photograph, and its hole is pasted into the photograph."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ import numpy as np
 
 from reffusion.io.images import to_uint8
 
-VISIBLE_CHANGE = 1.0  # levels of 255: smaller changes of colour are ignored
+VISIBLE_CHANGE = 1.0  # levels of 255: smaller changes of color are ignored
 SAMPLES = 5000  # pixels that are compared
 LEAST_PIXELS = 100  # pixels that determine a gain
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # with a gain beyond these bounds the fit is meaningless and ignored
 
 
 def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the gain and offset that map the colours of a picture to those of its photograph.
+    """Fit the gain and offset that map the colors of a picture to those of its photograph.
 
-    For each channel, photo = gain * picture + offset, with colours in [0, 1], is fitted robustly over known pixels.
+    For each channel, photo = gain * picture + offset, with colors in [0, 1], is fitted robustly over known pixels.
 
     Args:
         picture, photo: uint8 [H, W, 3], aligned with each other.
         known: bool [H, W], the pixels to compare.
 
     Returns:
-        Gain and offset, [3] each. They are 1 and 0 if they would hardly change any colour, or if a gain is not within
+        Gain and offset, [3] each. They are 1 and 0 if they would hardly change any color, or if a gain is not within
         `LEAST_GAIN` and `MOST_GAIN`.
     """
     x, y = (_samples(image, known) for image in (picture, photo))
@@ -37,7 +37,7 @@ def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> t
 
 
 def recolor(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return gain * picture + offset, computed for colours in [0, 1] and clipped there, as uint8 [H, W, 3].
+    """Return gain * picture + offset, computed for colors in [0, 1] and clipped there, as uint8 [H, W, 3].
 
     Args:
         picture: uint8 [H, W, 3].
@@ -52,7 +52,7 @@ def paste(
     """Return the photograph, uint8 [H, W, 3], with the hole of the picture pasted in where the picture covers it.
 
     Args:
-        picture: uint8 [H, W, 3], aligned with the photograph and matched to its colours.
+        picture: uint8 [H, W, 3], aligned with the photograph and matched to its colors.
         photo: uint8 [H, W, 3].
         hole: bool [H, W].
         inside: bool [H, W], the pixels that the picture covers.
@@ -66,7 +66,7 @@ def paste(
 
 
 def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return [N, 3], the low-passed colours in [0, 1] of about `SAMPLES` known pixels, evenly spaced."""
+    """Return [N, 3], the low-passed colors in [0, 1] of about `SAMPLES` known pixels, evenly spaced."""
     rows, columns = np.nonzero(known)
     every = max(1, len(rows) // SAMPLES)
     soft = cv2.GaussianBlur(image, (0, 0), 1.5)

@@ -47,15 +47,15 @@ IDENTITY = np.eye(2, 3)
 
 @dataclass(frozen=True)
 class Registration:
-    """The alignment of a picture with its photograph, in position and colour, and how well both agree then.
+    """The alignment of a picture with its photograph, in position and color, and how well both agree then.
 
     Attributes:
         affine: [2, 3], the affine map from pixels of the photograph to pixels of the picture; None if the picture is
             aligned without one.
         max_shift: px, the largest distance by which the map moves a corner of the picture. Here and in
             `median_displacement`, pixels are those of the full-size picture.
-        gain, offset: [3] each, so that photograph = gain * picture + offset for colours in [0, 1]; 1 and 0 if the
-            colours need no correction.
+        gain, offset: [3] each, so that photograph = gain * picture + offset for colors in [0, 1]; 1 and 0 if the
+            colors need no correction.
         point_count: number of points that were compared.
         inlier_ratio: share in [0, 1] of all compared points, tracked or not, that the aligned picture shows at the same
             place as the photograph; NaN if there are too few points.
@@ -104,7 +104,7 @@ class Registration:
 
 
 def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working: int = WORKING_SIDE) -> Registration:
-    """Align a picture with its photograph, in position and colour.
+    """Align a picture with its photograph, in position and color.
 
     The picture is not moved if the best affine map hardly moves it or improves nothing.
 
@@ -175,7 +175,7 @@ def warp(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """
     height, width = picture.shape[:2]
     linear, shift = moved[:, :2], moved[:, 2] + (moved[:, :2] - np.eye(2)) @ (0.5, 0.5)
-    matrix = np.concatenate([linear, shift[:, None]], 1)  # OpenCV's origin is the centre of the first pixel
+    matrix = np.concatenate([linear, shift[:, None]], 1)  # OpenCV's origin is the center of the first pixel
     read = cv2.warpAffine(picture, matrix, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
                           borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).astype(np.float32)
@@ -234,7 +234,7 @@ class _Pair:
         """Compare the photograph with the picture after the picture is resampled by a map.
 
         Returns:
-            Gain and offset, [3] each, which match the colours of the picture to the photograph's; and the tracks, from
+            Gain and offset, [3] each, which match the colors of the picture to the photograph's; and the tracks, from
             points of the photograph to the places where the resampled picture shows them.
         """
         if moved is IDENTITY:
@@ -311,9 +311,9 @@ def _shift(moved: np.ndarray, shape: tuple[int, ...]) -> float:
 def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> np.ndarray | None:
     """Estimate the affine map from SIFT features, matched at `known` photograph pixels; None for too few matches."""
     finder = cv2.SIFT_create(1000)
-    grey = lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    in_photo, of_photo = finder.detectAndCompute(grey(photo), known.astype(np.uint8))
-    in_picture, of_picture = finder.detectAndCompute(grey(picture), None)
+    gray = lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    in_photo, of_photo = finder.detectAndCompute(gray(photo), known.astype(np.uint8))
+    in_picture, of_picture = finder.detectAndCompute(gray(picture), None)
     if of_photo is None or of_picture is None or min(len(in_photo), len(in_picture)) < tracks.LEAST_PAIRS:
         return None
     pairs = [p for p in cv2.BFMatcher().knnMatch(of_photo, of_picture, k=2) if len(p) == 2]

@@ -1,7 +1,7 @@
 """Sparse optical flow between a photograph and a picture of the same view, and the affine map that explains most of it.
 
 Both are low-passed first, because an autoencoder that redrew the picture changes fine texture; coarser structure stays
-in place. Pictures are grey, float32 [H, W], in levels of 255. An affine map [2, 3] takes a pixel of the photograph to
+in place. Pictures are gray, float32 [H, W], in levels of 255. An affine map [2, 3] takes a pixel of the photograph to
 the pixel of the picture that shows the same point (docs/architecture.md#conventions).
 """
 
@@ -69,29 +69,29 @@ def estimate_affine(source: np.ndarray, target: np.ndarray, inlier: float) -> np
     return found if found is not None and agree.sum() >= LEAST_PAIRS and np.isfinite(found).all() else None
 
 
-def low_pass(grey: np.ndarray) -> np.ndarray:
+def low_pass(gray: np.ndarray) -> np.ndarray:
     """Return the picture, float32 [H, W], blurred by a Gaussian.
 
     Its standard deviation is `LOW_PASS` times the longer side of the picture, at least `LEAST_LOW_PASS` px.
     """
-    sigma = max(LOW_PASS * max(grey.shape), LEAST_LOW_PASS)
-    return cv2.GaussianBlur(grey.astype(np.float32), (0, 0), sigma)
+    sigma = max(LOW_PASS * max(gray.shape), LEAST_LOW_PASS)
+    return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma)
 
 
-def find_points(grey: np.ndarray, known: np.ndarray) -> np.ndarray:
+def find_points(gray: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return [N, 2], px (x, y), points of a low-passed picture with texture in every direction: corners and blobs.
 
     The points lie at least `SPACING` apart and so spread over the picture.
 
     Args:
-        grey: float32 [H, W], the low-passed picture.
+        gray: float32 [H, W], the low-passed picture.
         known: bool [H, W], the pixels in which points are sought.
     """
-    textured = known & (_least_gradient(grey) > TEXTURE)
+    textured = known & (_least_gradient(gray) > TEXTURE)
     if not textured.any():
         return np.zeros((0, 2))
-    apart, block = max(2.0, SPACING * max(grey.shape)), _odd(WINDOW * max(grey.shape) / 2)
-    found = cv2.goodFeaturesToTrack(grey, 0, 1e-4, apart, mask=textured.astype(np.uint8), blockSize=block)
+    apart, block = max(2.0, SPACING * max(gray.shape)), _odd(WINDOW * max(gray.shape) / 2)
+    found = cv2.goodFeaturesToTrack(gray, 0, 1e-4, apart, mask=textured.astype(np.uint8), blockSize=block)
     return np.zeros((0, 2)) if found is None else found[:, 0].astype(np.float64) + 0.5
 
 
@@ -116,10 +116,10 @@ def track(photo: np.ndarray, picture: np.ndarray, points: np.ndarray) -> Tracks:
     return Tracks(points, (forward - start)[:, 0].astype(np.float64), tracked)
 
 
-def _least_gradient(grey: np.ndarray) -> np.ndarray:
+def _least_gradient(gray: np.ndarray) -> np.ndarray:
     """Return [H, W], the gradient along the direction in which it is least, in levels of 255 per px."""
-    side = _odd(WINDOW * max(grey.shape) / 2)
-    across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
+    side = _odd(WINDOW * max(gray.shape) / 2)
+    across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
     xx, xy, yy = (cv2.blur(each, (side, side)) for each in (across * across, across * down, down * down))
     # The gradient is the root mean square of the directional derivative in a window around each pixel.
     least = (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2

@@ -39,7 +39,7 @@ def undistort_reference(
     if alpha is None:
         return image, inside
     share = _resample(alpha, given, lens, affine)[0] / 255.0
-    blended = image + (1 - share[..., None]) * photo  # `load_image` multiplied the colours by alpha
+    blended = image + (1 - share[..., None]) * photo  # `load_image` multiplied the colors by alpha
     return np.round(blended).clip(0, 255).astype(np.uint8), inside & (share >= 0.5)
 
 

@@ -21,7 +21,7 @@ from reffusion.types import Camera, Gaussians
 
 SIDE = 160  # px, the longer side to which views are reduced before their surfaces are compared
 SAME_SURFACE = 0.1  # relative difference of depth within which two views show the same surface
-GREY = 128  # grey level of the pixels to be painted
+GRAY = 128  # gray level of the pixels to be painted
 LEAST_GAIN = 0.02  # share of all pixels to be invented that a view must newly cover to be ranked
 
 
@@ -146,9 +146,9 @@ def painting_template(known: np.ndarray, invent: np.ndarray) -> np.ndarray:
 
     Args:
         known: uint8 [H, W, 3], the view without the object, as far as it is known.
-        invent: bool [H, W], the pixels to be invented; they become grey.
+        invent: bool [H, W], the pixels to be invented; they become gray.
     """
-    return np.where(invent[..., None], np.uint8(GREY), known)
+    return np.where(invent[..., None], np.uint8(GRAY), known)
 
 
 def format_ranking(views: Sequence[RankedView], painted: Sequence[str]) -> str:

@@ -108,7 +108,7 @@ def lpips_need() -> Need:
 def segmenter_need() -> Need:
     """Return the need for the default segmentation network, which makes masks from clicks."""
     here = all((segmenter_cache() / name).is_file() for name in SEGMENTER_FILES)
-    problem = None if here else "clicks are segmented by colours and surfaces: no network on this machine"
+    problem = None if here else "clicks are segmented by colors and surfaces: no network on this machine"
     return Need(SEGMENTER_NAME, problem, SEGMENTER.bytes, optional=True)
 
 

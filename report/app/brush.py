@@ -42,7 +42,7 @@ def fill(scene: OpenScene, view: str, content: bytes, seed: int) -> bytes:
 
     Args:
         view: name of a training view.
-        content: bytes of a PNG of the view's size. Pixels with an alpha below `OPAQUE` are filled, and their colours
+        content: bytes of a PNG of the view's size. Pixels with an alpha below `OPAQUE` are filled, and their colors
             are not read.
         seed: seed of the search for patches; another seed gives another filling.
 

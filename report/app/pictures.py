@@ -25,7 +25,7 @@ from report.sheet import stage_folder
 SMALL = 240  # longer side of a thumbnail, px
 KEPT = 64  # pictures that stay in memory
 OWN_FRAME = "scene.ply"  # the name of files in the scene's own frame
-# Origins of pixels (reffusion/initialize/origins.py) that the page marks, by their colour there -> RGBA of the overlay.
+# Origins of pixels (reffusion/initialize/origins.py) that the page marks, by their color there -> RGBA of the overlay.
 UNSURE = {(60, 120, 255): (60, 120, 255, 110), (255, 170, 0): (255, 170, 0, 130), (220, 30, 50): (220, 30, 50, 170)}
 RENDERING = threading.Lock()  # the rasterizer uses all threads for one picture
 

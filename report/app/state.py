@@ -101,7 +101,7 @@ def find_doubts(home: Path) -> list[str]:
 
 
 def has_network(scene: OpenScene) -> bool:
-    """Return whether a network segments the object around a click; otherwise colours and surfaces do."""
+    """Return whether a network segments the object around a click; otherwise colors and surfaces do."""
     if scene.mask_step is not None:
         return scene.mask_step.session.segmenter is not None
     return all((segmenter_folder(AUTO) / name).is_file() for name in SEGMENTER_FILES)

@@ -39,4 +39,4 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     """Say if clicks will be segmented without a network; else return an empty list."""
     if not params.clicks or segmenter_facts(params.segmenter)["segmenter"] != NONE:
         return []
-    return ["clicks are segmented by colours and surfaces; with the network of `make weights`, fewer clicks suffice"]
+    return ["clicks are segmented by colors and surfaces; with the network of `make weights`, fewer clicks suffice"]

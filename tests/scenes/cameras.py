@@ -101,7 +101,7 @@ def meet_box(view: Camera, low: Vector, high: Vector) -> tuple[np.ndarray, np.nd
 
 
 def uneven_depth_view(view: Camera, depth: np.ndarray, hidden: np.ndarray, tolerance: float = 0.0) -> DepthView:
-    """Return a DepthView whose depth range at each pixel holds the depths of all neighbouring pixels.
+    """Return a DepthView whose depth range at each pixel holds the depths of all neighboring pixels.
 
     Args:
         depth: [H, W], camera z.

@@ -38,7 +38,7 @@ def natural_noise(seed: int, size=(160, 120)) -> np.ndarray:
     rng, (width, height) = np.random.default_rng(seed), size
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
     fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) / frequency).real for _ in range(3)]
-    mixed = [fields[0] + 0.3 * field for field in fields]  # mostly grey, as photographs are
+    mixed = [fields[0] + 0.3 * field for field in fields]  # mostly gray, as photographs are
     return np.stack([np.clip(128 + 40 * f / f.std(), 0, 255) for f in mixed], -1).astype(np.uint8)
 
 
@@ -47,6 +47,6 @@ def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
 
 
 def render_color(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return the rendered colours, float32 [H, W, 3], which may lie outside [0, 1]."""
+    """Return the rendered colors, float32 [H, W, 3], which may lie outside [0, 1]."""
     with torch.no_grad():
         return rasterizer.render(gaussians, camera).color.numpy()

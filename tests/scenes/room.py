@@ -45,7 +45,7 @@ def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), 
 def room_walk(count: int) -> dict[str, np.ndarray]:
     """Return view name -> pose [4, 4] from world to camera, of `count` views that face the corner.
 
-    The camera centres alternate in height, because a similarity cannot be estimated from centres on one line.
+    The camera centers alternate in height, because a similarity cannot be estimated from centers on one line.
     """
     result = {}
     for k in range(count):

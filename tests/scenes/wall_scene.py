@@ -37,7 +37,7 @@ TRAIN, TEST = ("a0", "a1", "a2", "a3", "a4"), ("t0", "t1")
 
 
 def wall_color(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the colour [..., 3] in [0, 1] of the wall at (x, y)."""
+    """Return the color [..., 3] in [0, 1] of the wall at (x, y)."""
     return np.stack([0.5 + 0.3 * np.sin(9 * x), 0.5 + 0.3 * np.cos(8 * y), 0.5 + 0.2 * np.sin(6 * (x + y))], -1)
 
 
@@ -47,7 +47,7 @@ def rectangle_gaussians(depth: float, half_x: float, half_y: float, color):
     Args:
         depth: z of the rectangle.
         half_x, half_y: half its width and height.
-        color: function (x, y) -> colours [..., 3] in [0, 1].
+        color: function (x, y) -> colors [..., 3] in [0, 1].
     """
     wide, high = (max(2, round(2 * half * FOCAL / depth * 1.3)) for half in (half_x, half_y))
     fx, fy = wide * depth / 2 / half_x, high * depth / 2 / half_y

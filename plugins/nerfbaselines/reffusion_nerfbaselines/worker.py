@@ -90,7 +90,7 @@ def _scene(folder: str) -> tuple[Any, Similarity]:
 
 
 def render(folder: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
-    """A view of a checkpoint: colour as the 8-bit picture that RefFusion scores, depth in the scene's own unit."""
+    """A view of a checkpoint: color as the 8-bit picture that RefFusion scores, depth in the scene's own unit."""
     gaussians, similarity = _scene(str(folder))
     to_world = np.eye(4)
     to_world[:3] = pose

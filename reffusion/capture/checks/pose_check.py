@@ -34,9 +34,9 @@ NOISE = 4.0  # levels of 255, added to the standard deviation in a window, so th
 POINTS = 5000  # largest number of points that are compared
 DENSITY = 12  # mean number of points per square of the visibility test, in which the nearest point hides others
 LEAST_SHARED = 50  # visible points that two views must share to be compared
-LEAST_POINTS = 250  # points that a view must share with all its neighbours together; fewer correlate by chance
-NEIGHBOURS = 6  # number of views with which each view is compared
-LEAST_NEIGHBOURS = 2  # with fewer neighbours, a view is not judged
+LEAST_POINTS = 250  # points that a view must share with all its neighbors together; fewer correlate by chance
+NEIGHBORS = 6  # number of views with which each view is compared
+LEAST_NEIGHBORS = 2  # with fewer neighbors, a view is not judged
 # cosine of 35 degrees: views whose axes differ by more see different sides of objects, and are not compared
 TURN = np.cos(np.radians(35))
 LEAST_DETAIL = 0.2  # root mean square of the detail at the points, below which pictures are too plain to compare
@@ -83,7 +83,7 @@ def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callabl
     views = {camera.name: _View.of(camera, points, image_of(camera.name), cells) for camera in cameras}
     order = {name: _nearest(view, views.values()) for name, view in views.items()}
     kept = set(views)
-    around = lambda name: [other for other in order[name] if other in kept][:NEIGHBOURS]
+    around = lambda name: [other for other in order[name] if other in kept][:NEIGHBORS]
     compare = lambda names: {name: _margin(views[name], [views[other] for other in around(name)]) for name in names}
     margins = compare(sorted(views))
     judged = sum(margin is not None for margin in margins.values())
@@ -150,7 +150,7 @@ class _View:
         return [np.fft.rfft2(each, self.padded) for each in pictures]
 
     def distance(self, other: _View) -> float:
-        """Return the distance between the centres of two cameras, plus the angle between their axes in radians."""
+        """Return the distance between the centers of two cameras, plus the angle between their axes in radians."""
         cosine = float(self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3])
         return float(np.linalg.norm(self.camera.center - other.camera.center) + np.arccos(np.clip(cosine, -1, 1)))
 
@@ -176,11 +176,11 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
     """Return the correlation at a view's pose minus the best at another shift; None if too little can be compared."""
-    if len(others) < LEAST_NEIGHBOURS:
+    if len(others) < LEAST_NEIGHBORS:
         return None
     count = sum(each.seen & view.seen for each in others)
     known = np.flatnonzero(count)
-    # the neighbours' detail at the points predicts that of the view
+    # the neighbors' detail at the points predicts that of the view
     expected = sum(np.where(view.seen, each.values, 0) for each in others)[known] / count[known]
     plain = min(np.sqrt(np.mean(each**2)) for each in (expected, view.values[known])) < LEAST_DETAIL
     if len(known) < LEAST_POINTS or plain:

@@ -15,7 +15,7 @@ from reffusion.io.colmap import ModelCamera
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
-PointCloud = tuple[np.ndarray, np.ndarray]  # positions [P, 3] float64 and colours [P, 3] uint8
+PointCloud = tuple[np.ndarray, np.ndarray]  # positions [P, 3] float64 and colors [P, 3] uint8
 NO_POINTS: PointCloud = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
@@ -27,7 +27,7 @@ class Poses:
         lenses: view name -> lens, at the size of the view's picture file (from structure from motion: of the reduced
             picture).
         world_to_camera: view name -> [4, 4] float64, rigid; the camera looks along +z, x right, y down.
-        points, colors: [P, 3] float64 positions and [P, 3] uint8 colours of sparse points; P may be 0.
+        points, colors: [P, 3] float64 positions and [P, 3] uint8 colors of sparse points; P may be 0.
         bounds: view name -> (near, far) depth; empty if the layout has none.
     """
 

@@ -23,7 +23,7 @@ def points_from_depth(
     lenses: Mapping[str, Lens],
     world_to_camera: Mapping[str, np.ndarray],
 ) -> PointCloud:
-    """Unproject a grid of pixels of up to `FRAMES` depth maps, and colour the points by the views' pictures.
+    """Unproject a grid of pixels of up to `FRAMES` depth maps, and color the points by the views' pictures.
 
     Pixels whose depth is unknown or not positive give no point.
 
@@ -37,7 +37,7 @@ def points_from_depth(
         world_to_camera: view name -> pose [4, 4].
 
     Returns:
-        Positions [P, 3] in the scene's frame and colours uint8 [P, 3].
+        Positions [P, 3] in the scene's frame and colors uint8 [P, 3].
     """
     names = sorted(depths)[:: -(-len(depths) // FRAMES)] if depths else []
     positions, colors = [NO_POINTS[0]], [NO_POINTS[1]]

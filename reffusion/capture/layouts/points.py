@@ -1,8 +1,8 @@
 """Tests whether sparse points are in the same frame as the cameras, and whether pictures belong to their poses.
 
 Users replace the points of a model by another point cloud, or lose the order of its pictures. Geometry alone does not
-reveal every such mistake, for example a cloud of another scale around the same middle. Colours do: at a point's
-projection, a picture shows the point's colour.
+reveal every such mistake, for example a cloud of another scale around the same middle. Colors do: at a point's
+projection, a picture shows the point's color.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from reffusion.io.images import load_thumbnail
 INSIDE = 0.02  # share of the points that must lie inside the picture of the median view
 FARTHEST = 100.0  # times the largest distance of a camera from the cameras' mean: farther points have no parallax
 TRACKED = 0.9  # share of the observations whose points must lie inside the observing view
-VIEWS, POINTS = 8, 8000  # about how many views and points, spread evenly, are used to compare colours
-SIDE = 320  # px, longer side of the reduced pictures from which colours are read
+VIEWS, POINTS = 8, 8000  # about how many views and points, spread evenly, are used to compare colors
+SIDE = 320  # px, longer side of the reduced pictures from which colors are read
 LEAST_POINTS = 50  # visible points that a view needs for the comparison
 LEAST_CONTRAST = 6.0  # levels of 255: smallest standard deviation of the points' brightness, and of the picture's
 CELLS, NEARLY = 40, 1.1  # cells along each side; points up to this many times the nearest depth of a cell are visible
-# Median correlation, below which colours contradict the frame. Right point clouds of five captures have .38 to .86; the
+# Median correlation, below which colors contradict the frame. Right point clouds of five captures have .38 to .86; the
 # same clouds scaled by 2, turned, mirrored or moved have up to .31.
 CORRELATED = 0.25
-GREY = np.full(3, 1 / 3)  # weights of red, green and blue
+GRAY = np.full(3, 1 / 3)  # weights of red, green and blue
 
 
 def keep_points_in_frame(
@@ -38,11 +38,11 @@ def keep_points_in_frame(
     """Return the points if they are in the frame of the poses, else no points.
 
     The points are refused if too few lie inside the pictures, if they are very far away, or if the pictures do not show
-    their colours. Points that are not finite are dropped.
+    their colors. Points that are not finite are dropped.
 
     Args:
         path: file of the points, for the message.
-        points: positions [P, 3] and colours [P, 3].
+        points: positions [P, 3] and colors [P, 3].
         pictures: view name -> picture file.
 
     Returns:
@@ -60,9 +60,9 @@ def keep_points_in_frame(
     apart = np.linalg.norm(centers - centers.mean(0), axis=1).max()
     if apart > 0 and np.median([np.median(z) for z in depths if len(z)]) > FARTHEST * apart:
         return refused
-    if _has_contrast(colors @ GREY):
+    if _has_contrast(colors @ GRAY):
         names = list(pictures)[:: -(-len(pictures) // VIEWS)]
-        of_view = lambda n: (read_grey(pictures[n]), poses.lenses[n], poses.world_to_camera[n])
+        of_view = lambda n: (read_gray(pictures[n]), poses.lenses[n], poses.world_to_camera[n])
         fits = np.array([correlate_colors(*of_view(name), positions, colors) for name in names])
         if (known := ~np.isnan(fits)).any() and np.median(fits[known]) < CORRELATED:
             return refused
@@ -86,12 +86,12 @@ def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.nd
 
 
 def correlate_colors(
-    grey: np.ndarray, lens: Lens, pose: np.ndarray, positions: np.ndarray, colors: np.ndarray
+    gray: np.ndarray, lens: Lens, pose: np.ndarray, positions: np.ndarray, colors: np.ndarray
 ) -> float:
     """Correlate the brightness of points with that of a picture at the points' projections.
 
     Args:
-        grey: [H, W] in [0, 255], brightness of the picture, at any size.
+        gray: [H, W] in [0, 255], brightness of the picture, at any size.
         lens: lens of the view, at any size.
         pose: [4, 4], world-to-camera pose of the view.
         positions: [P, 3].
@@ -103,14 +103,14 @@ def correlate_colors(
     """
     some = slice(None, None, max(1, len(positions) // POINTS))
     at = positions[some] @ pose[:3, :3].T + pose[:3, 3]
-    own, at = colors[some][at[:, 2] > 1e-9] @ GREY, at[at[:, 2] > 1e-9]
+    own, at = colors[some][at[:, 2] > 1e-9] @ GRAY, at[at[:, 2] > 1e-9]
     with np.errstate(all="ignore"):
         uv = to_pixels(at[:, :2] / at[:, 2:], lens) / (lens.width, lens.height)
         inside = ((uv > 0) & (uv < 1)).all(axis=1)
     uv, depth, own = uv[inside], at[inside, 2], own[inside]
     front = _is_nearest(uv, depth)
-    columns, rows = (uv[front] * grey.shape[::-1]).astype(int).T
-    seen, own = grey[rows, columns], own[front]
+    columns, rows = (uv[front] * gray.shape[::-1]).astype(int).T
+    seen, own = gray[rows, columns], own[front]
     if len(own) < LEAST_POINTS or not (_has_contrast(seen) and _has_contrast(own)):
         return float("nan")
     return float(np.corrcoef(seen, own)[0, 1])
@@ -122,9 +122,9 @@ def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return depth < NEARLY * nearest_depths(cells, depth)
 
 
-def read_grey(path: Path) -> np.ndarray:
+def read_gray(path: Path) -> np.ndarray:
     """Read a picture's brightness as float64 [h, w] in [0, 255], reduced to at most `SIDE` px on its longer side."""
-    return load_thumbnail(path, SIDE) @ GREY
+    return load_thumbnail(path, SIDE) @ GRAY
 
 
 def _has_contrast(values: np.ndarray) -> bool:

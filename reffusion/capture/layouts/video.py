@@ -28,7 +28,7 @@ from reffusion.io.splats import FORMATS
 
 MOST = 80  # largest number of selected frames: all their pairs can be matched within minutes
 FEWEST = 12  # smallest number of windows, and of frames that a video must have
-SPACING = 0.04  # distance between selected frames, in widths: neighbours still show mostly the same
+SPACING = 0.04  # distance between selected frames, in widths: neighbors still show mostly the same
 STILL = 0.25  # widths: a video whose picture moves less in total was taken from one place
 LOOKED_AT = 3000  # largest number of measured frames; in longer videos only every n-th is measured
 SHARP, FLOW = 640, 320  # px, longer side of the reduced frames for measuring sharpness, and motion
@@ -161,7 +161,7 @@ def _codec(video: Path) -> str:
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Return the sharpness of a grey picture, uint8 [H, W]; 0 if it is plain.
+    """Return the sharpness of a gray picture, uint8 [H, W]; 0 if it is plain.
 
     The sharpness is (variance of the Laplacian - `NOISE`) / (variance of the brightness + `NOISE`).
     """
@@ -184,7 +184,7 @@ class _MotionTracker:
         """Add the next frame and return its distance: the motion since the first frame, which never decreases.
 
         Args:
-            gray: grey picture of the frame, uint8 [H, W].
+            gray: gray picture of the frame, uint8 [H, W].
             sharp: sharpness of the frame.
 
         Returns:

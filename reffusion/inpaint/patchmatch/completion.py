@@ -1,7 +1,7 @@
 """Completion of a hole with patches of photographs, from coarse to fine.
 
 The method is PatchMatch with voting (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017). Patches follow
-the perspective of planes (after Huang et al. 2014), and are blended by their gradients. Every colour comes from a
+the perspective of planes (after Huang et al. 2014), and are blended by their gradients. Every color comes from a
 source image; no weights are needed.
 
 PAPER leaves open: who inpaints the reference (it shows results of several tools, and of people).
@@ -27,8 +27,8 @@ from reffusion.io.images import to_gray
 
 COARSEST_WIDTH = 40.0  # px, largest width of the hole at the coarsest level, where its content is laid out
 SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
-# Weights of the features by which patches are compared, beside the colours in levels of 255
-ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient, which distinguishes gravel from a wall of the same colour
+# Weights of the features by which patches are compared, beside the colors in levels of 255
+ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient, which distinguishes gravel from a wall of the same color
 PLANE_FEATURE = 50.0  # levels by which two smooth planes differ
 LAYER_FEATURE = 75.0  # levels by which two foreground layers differ
 NORMAL_FEATURE = 40.0  # levels per difference of normals
@@ -36,7 +36,7 @@ CHANNELS, VOTED = 9, 5  # features; the first ones, on which patches vote, since
 ROUGHNESS_WINDOW = 15  # px, side of the window of the local mean gradient
 TRUST_FALLOFF = 1.2  # factor by which trust falls with each pixel inwards from the hole's border
 MIN_TRUST = 0.02
-MASK_MARGIN = 1.5  # in units of PATCH_RADIUS: distance that the centre of a patch keeps from masked pixels
+MASK_MARGIN = 1.5  # in units of PATCH_RADIUS: distance that the center of a patch keeps from masked pixels
 MIN_PLACES = 200  # patches that the sources must offer at a level; if the finest has fewer, Telea's method is used
 FIRST_ROUNDS, FIRST_TRIES = 3, 60  # rounds of search, and random tries per pixel, of the first layout
 TRIES = 20  # random tries per pixel at the coarsest level; a fifth of it at all others
@@ -105,12 +105,12 @@ def complete(
 
 def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: Matches) -> np.ndarray:
     """Return the image, uint8 [H, W, 3], with the hole filled without seams by the patches' gradients."""
-    own = level.current[..., :3].copy()  # becomes the colour at the centre of each pixel's patch
+    own = level.current[..., :3].copy()  # becomes the color at the center of each pixel's patch
     right, below = np.zeros_like(own), np.zeros_like(own)
     count_right, count_below = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
     voting.gather_gradients(matches, level.hole, level.sources, right, below, count_right, count_below, own)
     right, below = right / np.maximum(count_right, 1)[..., None], below / np.maximum(count_below, 1)[..., None]
-    # the range of the colours at the centres of the patches and outside the hole
+    # the range of the colors at the centers of the patches and outside the hole
     low, high = own.min((0, 1)), own.max((0, 1))
     picture = image.copy()
     colors = blend(level.current[..., :3], hole, right, below, own)
@@ -142,16 +142,16 @@ def _build_pyramid(
 
 
 def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """Return colours and roughness along x and y, float32 [H, W, 5]; masked pixels take the nearest colour."""
+    """Return colors and roughness along x and y, float32 [H, W, 5]; masked pixels take the nearest color."""
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
-    grey = to_gray(image)
+    gray = to_gray(image)
     known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
     window = (ROUGHNESS_WINDOW, ROUGHNESS_WINDOW)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
-    # roughness is the local mean of the absolute gradient of the grey image
-    gradient = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
+    # roughness is the local mean of the absolute gradient of the gray image
+    gradient = [cv2.blur(np.abs(cv2.Scharr(gray, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
     return np.concatenate([image.astype(np.float32), ROUGHNESS_WEIGHT * np.stack(gradient, -1)], -1)
 
 
@@ -211,7 +211,7 @@ def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequ
 
 
 def _patch_positions(sources: Sources, last_plane: int) -> Positions:
-    """List all places at which patches may have their centre, then those on each plane up to index `last_plane`."""
+    """List all places at which patches may have their center, then those on each plane up to index `last_plane`."""
     places = np.argwhere(sources.plane >= 0).astype(np.int32)
     plane = sources.plane[tuple(places.T)]
     parts = [places] + [places[plane == k] for k in range(1, last_plane + 1)]

@@ -22,9 +22,9 @@ class Sources(NamedTuple):
     """K images from which patches are taken, padded to one size.
 
     Attributes:
-        values: [K, H, W, C] float32, colours in [0, 255], followed by the other features by which patches are compared.
+        values: [K, H, W, C] float32, colors in [0, 255], followed by the other features by which patches are compared.
         plane: [K, H, W] int32, index of the plane that a pixel shows, 1, 2, ...; 0 for none; -1 if no patch may have
-            its centre here.
+            its center here.
         to_pixels: [K, H, W, 4] float32, derivative of the pixel (x, y) with respect to the coordinates on the plane, a
             2 x 2 matrix by rows.
         pixel_size: [K, H, W] float32, length of a pixel on the surface, in world units.
@@ -75,11 +75,11 @@ class Level(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """The match of each of the N pixels of the hole (nearest-neighbour field): the source patch that it takes.
+    """The match of each of the N pixels of the hole (nearest-neighbor field): the source patch that it takes.
 
     Attributes:
         source: [N] int32, index of the source image; -1 for no patch.
-        row, column: [N] float32, centre of the patch in the source image.
+        row, column: [N] float32, center of the patch in the source image.
         angle: [N] float32, radians by which the patch is turned in its plane.
         along_plane: [N] bool, True if the patch follows the perspective of its plane.
         misfit: [N] float32, how badly the patch fits (`search.misfit`); `NO_MATCH` if the pixel has no patch, or one
@@ -95,7 +95,7 @@ class Matches(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """The places at which a patch may have its centre, as a list for random draws.
+    """The places at which a patch may have its center, as a list for random draws.
 
     Attributes:
         places: [M, 3] int32 (source, row, column): first all places, then again those on plane 1, on plane 2, ...

@@ -53,7 +53,7 @@ def misfit(n, along_plane, source, y, x, angle, limit, level):
     Args:
         n: index of the pixel of the hole.
         along_plane: whether the patch follows the perspective of the pixel's plane.
-        source, y, x: index of the source image, and row and column of the patch's centre.
+        source, y, x: index of the source image, and row and column of the patch's center.
         angle: radians by which the patch is turned in its plane.
         limit: the largest misfit of interest, for example that of the present patch.
         level: `Level`.
@@ -120,7 +120,7 @@ def _try_match(matches, n, along_plane, source, y, x, angle, level):
 
 @inlined
 def _propagate(matches, n, level):
-    """Try for pixel n the patches of its four neighbours in the hole, moved by one pixel."""
+    """Try for pixel n the patches of its four neighbors in the hole, moved by one pixel."""
     hole, (height, width) = level.hole, level.current.shape[:2]
     for side in range(4):
         dy, dx = (-1, 1, 0, 0)[side], (0, 0, -1, 1)[side]
@@ -167,7 +167,7 @@ def _search_anywhere(matches, n, level, positions, state):
 def search(todo, rounds, tries, matches, level, positions, state):
     """Improve the matches of pixels of the hole, in place.
 
-    The misfit of a pixel's present patch is computed anew. Then the patches of its neighbours, random places near its
+    The misfit of a pixel's present patch is computed anew. Then the patches of its neighbors, random places near its
     present patch, and `tries` random places anywhere are tried, and the best one is kept.
 
     Args:

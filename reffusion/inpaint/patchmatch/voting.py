@@ -105,9 +105,9 @@ def upsample_matches(matches, coarse_row, coarse_column, hole, sources):
 
 @kernel
 def gather_gradients(matches, hole, sources, right, below, count_right, count_below, own):
-    """Sum the colour differences between neighbouring pixels as the matched patches show them, and sample the patches.
+    """Sum the color differences between neighboring pixels as the matched patches show them, and sample the patches.
 
-    For each pair of neighbours, each pixel of the pair that lies in the hole adds the difference that its own patch
+    For each pair of neighbors, each pixel of the pair that lies in the hole adds the difference that its own patch
     shows between the two.
 
     Args:
@@ -117,7 +117,7 @@ def gather_gradients(matches, hole, sources, right, below, count_right, count_be
         right, below: [H, W, 3] float32, zeros at first; get the sums of the differences from each pixel to the next one
             on the right, and below.
         count_right, count_below: [H, W] float32, zeros at first; get the number of summands.
-        own: [H, W, 3] float32; gets the colour at the centre of each pixel's patch. Pixels that no patch fills keep
+        own: [H, W, 3] float32; gets the color at the center of each pixel's patch. Pixels that no patch fills keep
             their values.
     """
     height, width = own.shape[:2]

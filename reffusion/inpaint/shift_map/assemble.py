@@ -5,7 +5,7 @@ candidate for each pixel, so that adjacent pieces meet where they look alike. Po
 The candidates come from `photo_offsets` (shifts of the view's own photograph) or `plane_motions` (photographs of a
 plane, moved by motions that map the plane's texture onto itself).
 
-Levels are colours in 0..255. The target is the view with the hole. The ring is a strip of known pixels around the hole,
+Levels are colors in 0..255. The target is the view with the hole. The ring is a strip of known pixels around the hole,
 in which candidates are compared with the known picture.
 """
 
@@ -39,7 +39,7 @@ class HolePixels:
     Attributes:
         rows, columns: [N] int, positions in the target.
         in_hole: bool [N], True for pixels of the hole, False for pixels of the ring.
-        colors, detail: [N, 3] float32, colours and detail of the target (`split_detail`); meaningless in the hole.
+        colors, detail: [N, 3] float32, colors and detail of the target (`split_detail`); meaningless in the hole.
     """
 
     rows: np.ndarray
@@ -100,7 +100,7 @@ class Options:
 
     Attributes:
         ring_weight: weight of the difference between a candidate and the known picture in the ring.
-        color_weight: weight of the pieces' colours in the Poisson blending; their gradients have weight 1.
+        color_weight: weight of the pieces' colors in the Poisson blending; their gradients have weight 1.
         max_cost: pixels with this cost or a higher one are not filled. The cost of a pixel is that of the candidate
             chosen for it (`Candidates.costs`), without seams.
         max_median_cost: if the median of these costs over the hole is higher, no candidate suits and nothing is filled.
@@ -130,9 +130,9 @@ class Assembly:
 
 
 def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the colours of an image in levels, and their detail, [H, W, 3] float32 each.
+    """Return the colors of an image in levels, and their detail, [H, W, 3] float32 each.
 
-    The detail of a pixel is the difference of its colour from the mean colour of the unmasked pixels around
+    The detail of a pixel is the difference of its color from the mean color of the unmasked pixels around
     (`DETAIL_SIGMA`).
 
     Args:
@@ -259,7 +259,7 @@ def _blend(
         mine = inner & region[window] & covered
         if mine.any():
             beside = ~inner & region[window] & ~target.masked[window]
-            # gradients have weight 1, the pieces' colours `color_weight`
+            # gradients have weight 1, the pieces' colors `color_weight`
             colors = blend(own, mine, *steps, own, beside, color_weight)
             image[window][mine] = colors.clip(0, 255).round().astype(np.uint8)
             filled[window] |= mine

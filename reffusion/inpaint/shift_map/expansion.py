@@ -1,6 +1,6 @@
 """Choice of one candidate for each pixel by expansion moves (Boykov et al. 2001).
 
-Neighbouring pixels with different candidates form a seam. The choice makes both candidates look alike along seams
+Neighboring pixels with different candidates form a seam. The choice makes both candidates look alike along seams
 (after Kwatra et al. 2003).
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from reffusion.graph_cut import min_cut
 
-COLOR_WEIGHT = 0.7  # weight of colour; the weight of detail (colour minus local mean) is 1
+COLOR_WEIGHT = 0.7  # weight of color; the weight of detail (color minus local mean) is 1
 GRADIENT_WEIGHT = 2.0  # weight of the difference of detail to the next pixel
 ROUNDS = 2  # passes of expansion moves over all candidates
 COST_SCALE = 0.1  # factor on all costs, so that their sum fits the 32-bit integers of the cut
@@ -21,24 +21,24 @@ def features(
 ) -> np.ndarray:
     """Return [N, 8] float32, the features by which the appearance of a candidate is compared at N pixels.
 
-    They are the weighted colour, the detail, and the weighted gradient of the grey detail.
+    They are the weighted color, the detail, and the weighted gradient of the gray detail.
 
     Args:
         rows, columns: [N], positions of the pixels, on a grid with a spacing of `stride` px.
-        colors: [N, 3], colours in levels of 255.
-        detail: [N, 3], colours minus their local mean.
+        colors: [N, 3], colors in levels of 255.
+        detail: [N, 3], colors minus their local mean.
         shape: height and width of the picture.
         stride: px, distance to the next pixel of the grid.
     """
     grid = np.zeros(shape, np.float32)
-    grey = detail.mean(1)
-    grid[rows, columns] = grey
+    gray = detail.mean(1)
+    grid[rows, columns] = gray
     known = np.zeros(shape, bool)
     known[rows, columns] = True
     gradients = []
     for down, right in ((0, stride), (stride, 0)):
         row, column = np.minimum(rows + down, shape[0] - 1), np.minimum(columns + right, shape[1] - 1)
-        gradients.append(np.where(known[row, column], grid[row, column] - grey, 0))
+        gradients.append(np.where(known[row, column], grid[row, column] - gray, 0))
     gradient = GRADIENT_WEIGHT * np.stack(gradients, 1)
     return np.concatenate([COLOR_WEIGHT * colors, detail, gradient], 1).astype(np.float32)
 
@@ -49,7 +49,7 @@ def feature_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
-    """Return [E, 2], all pairs of horizontal or vertical neighbours on a grid, as indices into the N pixels.
+    """Return [E, 2], all pairs of horizontal or vertical neighbors on a grid, as indices into the N pixels.
 
     Args:
         rows, columns: [N], positions of the pixels.
@@ -66,13 +66,13 @@ def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]
 def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Choose one of L candidates for each of N pixels, so that the total cost is low.
 
-    The total cost is the sum of all pixels' own costs and of a seam cost for each pair of neighbours. The seam cost is
-    the feature distance between the candidates of the two neighbours, at the one pixel and at the other.
+    The total cost is the sum of all pixels' own costs and of a seam cost for each pair of neighbors. The seam cost is
+    the feature distance between the candidates of the two neighbors, at the one pixel and at the other.
 
     Args:
         cost: [L, N], the cost of each candidate at each pixel.
         look: [L, N, 8], the `features` of the candidates.
-        pairs: [E, 2], indices of neighbouring pixels.
+        pairs: [E, 2], indices of neighboring pixels.
 
     Returns:
         [N] int, the index of the candidate of each pixel.

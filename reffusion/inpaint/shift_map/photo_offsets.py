@@ -2,7 +2,7 @@
 
 The candidates are the photograph, shifted by the most frequent offsets between similar patches. A piece should come
 from a surface of about the same orientation and depth as the surface in the hole. Large pieces continue paths and edges
-from one side of the hole to the other, and keep grass as sharp as it is. Levels are colours in 0..255.
+from one side of the hole to the other, and keep grass as sharp as it is. Levels are colors in 0..255.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class _ShiftedPhoto:
 
     Attributes:
         target: the view with the hole.
-        colors, detail: [H, W, 3] float32, colours and detail of the photograph (`split_detail`).
-        tone: [H, W, 3] float32, the blurred colours.
+        colors, detail: [H, W, 3] float32, colors and detail of the photograph (`split_detail`).
+        tone: [H, W, 3] float32, the blurred colors.
         hole_tone: [H, W, 3] float32, the tone, interpolated across the hole from its surroundings.
         readable: bool [H, W], the pixels of the photograph from which pieces may be taken.
         layer: int [H, W], the foreground layer that each pixel of the photograph shows.
@@ -185,7 +185,7 @@ def _stretch(target: SourceImage, source: tuple[np.ndarray, ...], here: tuple[np
 
 
 def _blur_known(colors: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3], the tone: the mean of the colours around each pixel, without `missing` pixels, bool [H, W]."""
+    """Return [H, W, 3], the tone: the mean of the colors around each pixel, without `missing` pixels, bool [H, W]."""
     known = (~missing).astype(np.float32)
     blur = lambda a: cv2.GaussianBlur(a, (0, 0), TONE_SIGMA_PX).reshape(*missing.shape, -1)
     return blur(colors * known[..., None]) / np.maximum(blur(known), 1e-3)

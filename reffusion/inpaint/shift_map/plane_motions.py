@@ -1,7 +1,7 @@
 """Candidates for a hole in a plane whose texture repeats itself: photographs of the plane, moved along the plane.
 
-The motions are those that map the texture onto itself (`plane_symmetry`): shifts, or turns about a centre. So joints
-between planks continue straight, and circles about the centre stay circles. Levels are colours in 0..255. The ring is
+The motions are those that map the texture onto itself (`plane_symmetry`): shifts, or turns about a center. So joints
+between planks continue straight, and circles about the center stay circles. Levels are colors in 0..255. The ring is
 the strip of known pixels around the hole, in which candidates are compared with the known picture.
 """
 
@@ -42,7 +42,7 @@ BLUR_COST = 12.0  # levels: cost of a pixel per halving of the scale below `FULL
 FULL_SCALE = 0.8  # source pixels per pixel of the hole (the scale), below which the pixel is blurred
 MIN_SCALE, MAX_SCALE = 0.35, 3.0  # bounds of the scale, along any direction
 OTHER_PHOTO_COST = 6.0  # levels: cost of a pixel from another photograph, whose light may differ
-# Colours of the pieces have a low weight in the blending, because the surroundings of the hole tell better what the
+# Colors of the pieces have a low weight in the blending, because the surroundings of the hole tell better what the
 # plane reflects there than the pieces do.
 OPTIONS = Options(color_weight=3e-4)
 
@@ -158,7 +158,7 @@ class PlaneMotions:
         return _is_set(self.photos[motion.photo].readable, self._source_pixels(motion, pixels))
 
     def detail_difference(self, motion: Motion, pixels: HolePixels) -> tuple[np.ndarray, np.ndarray]:
-        """Compare the detail (colour minus local mean) of the moved photograph with that of the known picture.
+        """Compare the detail (color minus local mean) of the moved photograph with that of the known picture.
 
         Args:
             motion: the motion of the photograph.
@@ -224,7 +224,7 @@ def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotion
 
 
 def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -> Motion:
-    """Shift the motion a little, and turn it a little about the centre if there is one, to match the ring best."""
+    """Shift the motion a little, and turn it a little about the center if there is one, to match the ring best."""
     symmetry = candidates.symmetry
 
     def misfit(motion: Motion) -> float:
@@ -232,15 +232,15 @@ def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -
         return float(difference[valid].mean()) if valid.sum() >= MIN_RING_PIXELS / 2 else np.inf
 
     radius = 1.0
-    if symmetry.centre is not None:
-        from_centre = candidates.target.plane_xy[ring.rows, ring.columns] - symmetry.centre
-        radius = float(np.median(np.linalg.norm(from_centre, axis=1)))
+    if symmetry.center is not None:
+        from_center = candidates.target.plane_xy[ring.rows, ring.columns] - symmetry.center
+        radius = float(np.median(np.linalg.norm(from_center, axis=1)))
     least = misfit(motion)
     for step in REFINE_STEPS:
         size = step * symmetry.resolution
         for _ in range(2):
             tried = [Motion(motion.photo, motion.base, motion.shift + size * np.array(to)) for to in SIDES]
-            if symmetry.centre is not None:
+            if symmetry.center is not None:
                 turned = [motion.base + turn * size / radius for turn in (-1, 1)]
                 tried += [Motion(motion.photo, each, motion.shift) for each in turned]
             misfits = [misfit(each) for each in tried]

@@ -32,42 +32,42 @@ PEAK_WINDOW = 9  # cells, side of the window that has one peak
 MIN_SHIFTS = 4  # shifts that a plane must have, for example a shift and its double, in both directions
 CLOSE_PX = 9  # px: gaps in the pixels of a plane up to this width are closed, since uneven depth leaves such gaps
 MAX_EDGES, LINE_PAIRS = 3000, 400  # steepest cells, whose edges are taken as lines; pairs of lines that are intersected
-SIN_TOLERANCE = 0.035  # sine of the angle by which a line may miss the centre
-MIN_CONVERGENCE = 1.25  # this many times as many lines must meet in the centre as are parallel to each other
-MAX_CENTRE_DISTANCE = 3.0  # distance from the map's middle within which the centre is sought, in units of `SIDE`
-CENTRE_REACH = 8.0  # cells to each side of the first estimate of the centre within which the centre is refined
-CENTRE_STEPS, MIN_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells, steps of the refinement; gain in correlation that continues it
-CENTRE_ITERATIONS = 5  # iterations of the least squares fit of the centre to its lines
+SIN_TOLERANCE = 0.035  # sine of the angle by which a line may miss the center
+MIN_CONVERGENCE = 1.25  # this many times as many lines must meet in the center as are parallel to each other
+MAX_CENTER_DISTANCE = 3.0  # distance from the map's middle within which the center is sought, in units of `SIDE`
+CENTER_REACH = 8.0  # cells to each side of the first estimate of the center within which the center is refined
+CENTER_STEPS, MIN_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells, steps of the refinement; gain in correlation that continues it
+CENTER_ITERATIONS = 5  # iterations of the least squares fit of the center to its lines
 HOMOGRAPHY_PIXELS = 2000  # pixels to which the homography is fitted
 SEED = 0  # seed of the random pairs of lines
 
 
 @dataclass(frozen=True)
 class PlaneSymmetry:
-    """The motions along a plane that map its texture onto itself: all shifts, or all turns about one centre.
+    """The motions along a plane that map its texture onto itself: all shifts, or all turns about one center.
 
     Attributes:
-        centre: [2], the point on the plane about which the texture turns; None if the motions are shifts.
+        center: [2], the point on the plane about which the texture turns; None if the motions are shifts.
         motions: [M, 2], shifts in world units, those of the highest correlation first; or [M, 1], turns in radians, in
             both directions, the smallest first.
         resolution: the accuracy of the motions, in world units: the side of a cell of the map. For turns it is the
             accuracy of the positions of turned points.
     """
 
-    centre: np.ndarray | None
+    center: np.ndarray | None
     motions: np.ndarray
     resolution: float
 
     def move(self, points: np.ndarray, motion: np.ndarray) -> np.ndarray:
         """Return the points on the plane, [N, 2], after a motion: a shift, [2], or a turn, [1]."""
-        if self.centre is None:
+        if self.center is None:
             return points + motion
         cosine, sine = np.cos(motion[0]), np.sin(motion[0])
-        return (points - self.centre) @ np.array([[cosine, sine], [-sine, cosine]]) + self.centre
+        return (points - self.center) @ np.array([[cosine, sine], [-sine, cosine]]) + self.center
 
     def rotation(self, motion: np.ndarray) -> np.ndarray:
         """Return [2, 2], the derivative of `move` by the point: a rotation matrix for a turn, else the identity."""
-        angle = 0.0 if self.centre is None else motion[0]
+        angle = 0.0 if self.center is None else motion[0]
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
@@ -89,7 +89,7 @@ class PlaneMap(NamedTuple):
     """The texture of a plane, sampled on a grid of cells.
 
     Attributes:
-        values: [h, w, 3] float32, colours in levels of 255.
+        values: [h, w, 3] float32, colors in levels of 255.
         known: bool [h, w], True where the image shows the plane.
         pitch: [2], the sides of a cell along x and y, in world units. In a polar map these are the steps of the radius,
             in world units, and of the angle, in radians.
@@ -113,22 +113,22 @@ def find_symmetry(seen: PlanePixels) -> PlaneSymmetry | None:
     plane_map = _cartesian_map(seen, low, high)
     if plane_map is None:
         return None
-    cell = _find_centre(plane_map, np.random.default_rng(seeding.seed_for(SEED, "lines")))
+    cell = _find_center(plane_map, np.random.default_rng(seeding.seed_for(SEED, "lines")))
     if cell is None:
         motions = _find_shifts(_autocorrelation(plane_map)) * plane_map.pitch
         return PlaneSymmetry(None, motions, plane_map.pitch[0]) if len(motions) else None
-    centre, polar = _refine_centre(seen, low + cell * plane_map.pitch, plane_map.pitch[0])
+    center, polar = _refine_center(seen, low + cell * plane_map.pitch, plane_map.pitch[0])
     if polar is None:
         return None
     motions = _find_turns(_autocorrelation(polar)[:, 0], 2 * np.pi / polar.pitch[1]) * polar.pitch[1]
-    return PlaneSymmetry(centre, motions[:, None], polar.pitch[0]) if len(motions) else None
+    return PlaneSymmetry(center, motions[:, None], polar.pitch[0]) if len(motions) else None
 
 
-def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[np.ndarray, PlaneMap | None]:
-    """Return the refined centre about which the texture turns, and the polar map about it, None if there is none."""
+def _refine_center(seen: PlanePixels, center: np.ndarray, cell: float) -> tuple[np.ndarray, PlaneMap | None]:
+    """Return the refined center about which the texture turns, and the polar map about it, None if there is none."""
 
     # The score is averaged over all turns. One turn alone would not do, because a short arc fits many circles, and so
-    # correlates about wrong centres too. If fewer than two turns are seen, the first estimate stays.
+    # correlates about wrong centers too. If fewer than two turns are seen, the first estimate stays.
     def judge(at: np.ndarray) -> tuple[float, PlaneMap | None]:
         polar = _polar_map(seen, at)
         return (
@@ -136,17 +136,17 @@ def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[
             polar,
         )
 
-    coarse = np.arange(-CENTRE_REACH, CENTRE_REACH + 1, CENTRE_STEPS[0])
-    starts = [centre + cell * np.array([x, y]) for y in coarse for x in coarse]
+    coarse = np.arange(-CENTER_REACH, CENTER_REACH + 1, CENTER_STEPS[0])
+    starts = [center + cell * np.array([x, y]) for y in coarse for x in coarse]
     scores = [judge(start)[0] for start in starts]
     if max(scores) > 0:
-        centre = starts[int(np.argmax(scores))]
-    best, polar = judge(centre)
-    for step in CENTRE_STEPS[1:]:
+        center = starts[int(np.argmax(scores))]
+    best, polar = judge(center)
+    for step in CENTER_STEPS[1:]:
         for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            while (score := judge(centre + step * cell * np.array(side)))[0] > best + MIN_GAIN:
-                (best, polar), centre = score, centre + step * cell * np.array(side)
-    return centre, polar
+            while (score := judge(center + step * cell * np.array(side)))[0] > best + MIN_GAIN:
+                (best, polar), center = score, center + step * cell * np.array(side)
+    return center, polar
 
 
 def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
@@ -160,8 +160,8 @@ def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
 def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
     """Return the normalised correlation [h, w] of a map with itself after shifts by cells, ordered as in an FFT."""
     known = cv2.erode(plane_map.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
-    grey = plane_map.values.mean(2)
-    detail = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
+    gray = plane_map.values.mean(2)
+    detail = np.where(known, gray - cv2.GaussianBlur(gray, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
     size = [cv2.getOptimalDFTSize(2 * side) for side in detail.shape]
     picture, mask, power = (np.fft.rfft2(each, size) for each in (detail, known.astype(float), detail**2))
     back = lambda spectrum: np.fft.irfft2(spectrum, size)
@@ -174,12 +174,12 @@ def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
 def _find_shifts(correlation: np.ndarray) -> np.ndarray:
     """Return the shifts (x, y) in cells, [M, 2], at an autocorrelation's peaks, highest first; none if low or few."""
     height, width = (side // 2 for side in correlation.shape)
-    centred = np.fft.fftshift(correlation)
-    peak = (centred == ndimage.maximum_filter(centred, PEAK_WINDOW)) & (centred > MIN_OF_BEST * MIN_CORRELATION)
+    centered = np.fft.fftshift(correlation)
+    peak = (centered == ndimage.maximum_filter(centered, PEAK_WINDOW)) & (centered > MIN_OF_BEST * MIN_CORRELATION)
     peak[height - MIN_SHIFT : height + MIN_SHIFT + 1, width - MIN_SHIFT : width + MIN_SHIFT + 1] = False
     rows, columns = np.nonzero(peak)
-    order = np.argsort(-centred[rows, columns], kind="stable")[:MAX_MOTIONS]
-    if len(order) < MIN_SHIFTS or centred[rows, columns].max() < MIN_CORRELATION:
+    order = np.argsort(-centered[rows, columns], kind="stable")[:MAX_MOTIONS]
+    if len(order) < MIN_SHIFTS or centered[rows, columns].max() < MIN_CORRELATION:
         return np.zeros((0, 2))
     return np.stack([columns[order] - width, rows[order] - height], 1).astype(np.float64)
 
@@ -218,9 +218,9 @@ def _cell_side(seen: PlanePixels, length: float) -> float:
     return max(length / SIDE, (area / len(seen.coordinates)) ** 0.5, 1e-9)
 
 
-def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
-    """Return the polar map about a centre, with a column per radius and a row per angle; None as in `_resample`."""
-    away = seen.coordinates - centre
+def _polar_map(seen: PlanePixels, center: np.ndarray) -> PlaneMap | None:
+    """Return the polar map about a center, with a column per radius and a row per angle; None as in `_resample`."""
+    away = seen.coordinates - center
     distance = np.hypot(*away.T)
     direction = np.angle(np.exp(1j * np.arctan2(away[:, 1], away[:, 0])).mean())  # the jump of the angle lies opposite
     angle = np.angle(np.exp(1j * (np.arctan2(away[:, 1], away[:, 0]) - direction)))
@@ -231,7 +231,7 @@ def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
     radii = np.arange(distance.min(), distance.max(), pitch[0])
     turns = direction + np.arange(angle.min(), angle.max(), pitch[1])
     radius, turn = np.meshgrid(radii, turns)
-    return _resample(seen, centre + radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1), pitch)
+    return _resample(seen, center + radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1), pitch)
 
 
 def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> PlaneMap | None:
@@ -250,10 +250,10 @@ def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> 
     return PlaneMap(values, cv2.remap(on_plane, x, y, cv2.INTER_NEAREST) > 0, pitch)
 
 
-def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray | None:
+def _find_center(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray | None:
     """Return the point (x, y), in cells, where the texture's lines meet; None if they are rather parallel or few."""
-    grey = cv2.GaussianBlur(plane_map.values.mean(2), (0, 0), 1.0)
-    gradient = np.stack([cv2.Scharr(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
+    gray = cv2.GaussianBlur(plane_map.values.mean(2), (0, 0), 1.0)
+    gradient = np.stack([cv2.Scharr(gray, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
     inner = cv2.erode(plane_map.known.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
     length = np.linalg.norm(gradient, axis=-1) * inner
     # each steep edge is a line
@@ -270,15 +270,15 @@ def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray 
     heights = (normals * at).sum(1)
     a, b, p, q = normals[first][crosses], normals[second][crosses], heights[first][crosses], heights[second][crosses]
     points = np.stack([p * b[:, 1] - q * a[:, 1], a[:, 0] * q - b[:, 0] * p], 1) / crossing[crosses, None]
-    middle = np.array(grey.shape[::-1]) / 2
-    points = points[np.linalg.norm(points - middle, axis=1) < MAX_CENTRE_DISTANCE * SIDE]
+    middle = np.array(gray.shape[::-1]) / 2
+    points = points[np.linalg.norm(points - middle, axis=1) < MAX_CENTER_DISTANCE * SIDE]
     if not len(points):
         return None
-    # the centre, perhaps outside the map, is the point that the most lines pass through
+    # the center, perhaps outside the map, is the point that the most lines pass through
     counts = [_meets(point, at, normals).sum() for point in points]
     parallel = max(int((np.abs(normals @ (-each[1], each[0])) < SIN_TOLERANCE).sum()) for each in normals[first])
     best = points[int(np.argmax(counts))]
-    for _ in range(CENTRE_ITERATIONS):
+    for _ in range(CENTER_ITERATIONS):
         mine = _meets(best, at, normals)
         weight = 1 / np.maximum(np.linalg.norm(at[mine] - best, axis=1), MIN_SIDE / 2)[:, None]
         best = np.linalg.lstsq(normals[mine] * weight, heights[mine, None] * weight, rcond=None)[0][:, 0]

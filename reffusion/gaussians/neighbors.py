@@ -1,4 +1,4 @@
-"""Neighbours among Gaussians: which are near each other, how alike they are, and how much they touch."""
+"""Neighbors among Gaussians: which are near each other, how alike they are, and how much they touch."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from reffusion.gaussians.densify import rotate
 from reffusion.splat.conventions import SH0
 from reffusion.types import Gaussians
 
-NEIGHBOURS = 8  # number of nearest neighbours to which each Gaussian has an edge
-UNLIKE = 1.0  # relative increase of an edge's length if its two colours differ as those of neighbours do on average
+NEIGHBORS = 8  # number of nearest neighbors to which each Gaussian has an edge
+UNLIKE = 1.0  # relative increase of an edge's length if its two colors differ as those of neighbors do on average
 
 
 @dataclass(frozen=True)
-class NeighbourGraph:
-    """The graph whose E edges join neighbouring Gaussians, with the similarity of their colours.
+class NeighborGraph:
+    """The graph whose E edges join neighboring Gaussians, with the similarity of their colors.
 
     Attributes:
         pairs: [E, 2] int, indices of the two Gaussians of each edge, the smaller one first; each pair occurs once.
-        likeness: [E] in [0, 1], similarity of the two colours: exp(-d / 2), where d is the squared distance of the two
-            RGB colours, divided by its mean over all edges.
+        likeness: [E] in [0, 1], similarity of the two colors: exp(-d / 2), where d is the squared distance of the two
+            RGB colors, divided by its mean over all edges.
         way: [E], positive, length of the edge: the distance of the two means times 1 + `UNLIKE` sqrt(d).
     """
 
@@ -32,21 +32,21 @@ class NeighbourGraph:
     way: np.ndarray
 
 
-def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
-    """Build the graph that joins each Gaussian to its `NEIGHBOURS` nearest ones, by the distance of means.
+def find_neighbors(gaussians: Gaussians) -> NeighborGraph:
+    """Build the graph that joins each Gaussian to its `NEIGHBORS` nearest ones, by the distance of means.
 
-    A Gaussian can have more than `NEIGHBOURS` edges, because other Gaussians may have it among their nearest ones.
-    Colours are compared without their view-dependent part.
+    A Gaussian can have more than `NEIGHBORS` edges, because other Gaussians may have it among their nearest ones.
+    Colors are compared without their view-dependent part.
     """
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
-    near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
+    near = cKDTree(means).query(means, min(NEIGHBORS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
     own = np.repeat(np.arange(len(means)), near.shape[1])
     pairs = np.unique(np.sort(np.stack([own, near.ravel()], 1), 1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     square = ((color[pairs[:, 0]] - color[pairs[:, 1]]) ** 2).sum(1)
     unlike = square / (square.sum() / max(len(square), 1) + 1e-12)
     apart = np.linalg.norm(means[pairs[:, 0]] - means[pairs[:, 1]], axis=1)
-    return NeighbourGraph(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
+    return NeighborGraph(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
 
 
 def measure_overlap(gaussians: Gaussians, pairs: np.ndarray) -> np.ndarray:
