@@ -46,7 +46,7 @@ def displace(picture: Tensor, hole: Tensor, shift: tuple[float, float]) -> Tenso
 
 
 def transplant(picture: Tensor, donors: Tensor, hole: Tensor) -> Tensor:
-    """Return pictures [N, 3, H, W] whose holes show the donors [N, 3, H, W], shifted smoothly to the known colours."""
+    """Return pictures [N, 3, H, W] whose holes show the donors [N, 3, H, W], shifted smoothly to the known colors."""
     difference = picture - donors
     shift = harmonic_fill.harmonic_extension(difference, hole.float().expand(len(donors), 1, -1, -1))
     return picture + hole * (shift - difference)

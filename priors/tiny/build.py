@@ -25,14 +25,14 @@ WORDS = (
     *("dark", "bright", "gray", "red", "orange", "yellow", "green", "blue", "purple"),
 )
 TEXT_LENGTH = 24
-# Opponent colours of (r, g, b) in [-1, 1]. Their rows in `analysis` are orthogonal and of equal length, so that an
-# error of the latents weighs the same in every direction of colour. Diffusers' inpainting pipeline wants four latents;
+# Opponent colors of (r, g, b) in [-1, 1]. Their rows in `analysis` are orthogonal and of equal length, so that an
+# error of the latents weighs the same in every direction of color. Diffusers' inpainting pipeline wants four latents;
 # the fourth is empty.
 LIGHT = 1.9
 WARM, GREEN = LIGHT * (2 / 3) ** 0.5, LIGHT * (8 / 9) ** 0.5
-# At full resolution the content of a hole is decided at strong noise, since neighbours average weak noise away. So the
+# At full resolution the content of a hole is decided at strong noise, since neighbors average weak noise away. So the
 # schedule spends most timesteps between a log signal-to-noise ratio of 0 and -7, and ends where even a hole's mean
-# colour is hidden (with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
+# color is hidden (with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
 TIMESTEPS, SHIFT, LOWEST = 1000, -2.2, -12.0
 
 

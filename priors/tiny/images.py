@@ -87,7 +87,7 @@ def image(
 
 
 def pixels() -> tuple[Field, Field]:
-    """Centres of the supersampled pixels, in image units centred at 0, about [-SIZE/2, SIZE/2]."""
+    """Centers of the supersampled pixels, in image units centerd at 0, about [-SIZE/2, SIZE/2]."""
     ticks = (np.arange(SIZE * SUPERSAMPLE, dtype=np.float32) + 0.5) / SUPERSAMPLE - SIZE / 2
     return np.meshgrid(ticks, ticks)
 
@@ -171,7 +171,7 @@ def bundled_photographs(held_out: bool = False) -> Photographs:
 
 
 def photo_crop(rng: np.random.Generator, photographs: Photographs) -> tuple[np.ndarray, str]:
-    """A crop of a photograph at a random scale, flipped, with its colours shifted."""
+    """A crop of a photograph at a random scale, flipped, with its colors shifted."""
     subject, photo = photographs[rng.integers(len(photographs))]
     side = int(SIZE * np.exp(rng.uniform(0, np.log(max(min(photo.shape[:2]) / SIZE, 1.01)))))
     top, left = rng.integers(photo.shape[0] - side + 1), rng.integers(photo.shape[1] - side + 1)
@@ -234,10 +234,10 @@ def silhouettes(rng: np.random.Generator, size: int) -> np.ndarray:
     """One to three objects' outlines, as polygons; bool [size, size]."""
     canvas = np.zeros((size, size), np.uint8)
     for _ in range(rng.integers(1, 4)):
-        centre = rng.uniform(0.15, 0.85, 2) * size
+        center = rng.uniform(0.15, 0.85, 2) * size
         count = rng.integers(5, 11)
         radius = size * rng.uniform(0.12, 0.45) * rng.uniform(0.6, 1.2, count)
         turn = np.sort(rng.uniform(0, 2 * np.pi, count))
-        outline = centre + np.stack([np.cos(turn) * radius, np.sin(turn) * radius * rng.uniform(0.6, 1.6)], 1)
+        outline = center + np.stack([np.cos(turn) * radius, np.sin(turn) * radius * rng.uniform(0.6, 1.6)], 1)
         cv2.fillPoly(canvas, [outline.astype(np.int32)], 1)
     return canvas.astype(bool)

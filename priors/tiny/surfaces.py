@@ -12,7 +12,7 @@ Field = np.ndarray  # [H, W] float32
 Texture = Callable[[Field, Field], np.ndarray]  # surface coordinates in texels -> [H, W, 3] in [0, 1]
 
 
-# ---------------------------------------------------------------------------------------------- noise and colour
+# ---------------------------------------------------------------------------------------------- noise and color
 
 
 def noise_tile(rng: np.random.Generator, slope: float, stretch: float = 1.0, size: int = 256) -> Field:
@@ -32,15 +32,15 @@ def sample(tile: Field, u: Field, v: Field, scale: float) -> Field:
     return cv2.remap(tile, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
 
-def colour(rng: np.random.Generator, saturation: float = 0.6) -> np.ndarray:
-    """One random colour [3], muted more often than vivid."""
+def color(rng: np.random.Generator, saturation: float = 0.6) -> np.ndarray:
+    """One random color [3], muted more often than vivid."""
     hue = rng.random() if rng.random() < 0.5 else rng.normal(0.08, 0.05) % 1
     return np.array(colorsys.hsv_to_rgb(hue, saturation * rng.random() ** 1.5, rng.uniform(0.15, 0.95)), np.float32)
 
 
 def shades(rng: np.random.Generator, count: int, spread: float = 0.12) -> np.ndarray:
-    """[count, 3] variations of one random colour."""
-    return np.clip(colour(rng) + rng.normal(0, spread, (count, 1)) + rng.normal(0, spread / 4, (count, 3)), 0, 1)
+    """[count, 3] variations of one random color."""
+    return np.clip(color(rng) + rng.normal(0, spread, (count, 1)) + rng.normal(0, spread / 4, (count, 3)), 0, 1)
 
 
 def per_cell(rng: np.random.Generator, columns: Field, rows: Field, spread: float) -> Field:
@@ -59,7 +59,7 @@ def blend(low: np.ndarray, high: np.ndarray, weight: Field) -> np.ndarray:
 def bricks(rng: np.random.Generator) -> Texture:
     width, height = rng.uniform(14, 40), rng.uniform(6, 16)
     gap, shift = rng.uniform(0.8, 2.5), rng.choice([0.5, 0.33, 0.0])
-    body, mortar, spread = colour(rng), colour(rng, 0.2), rng.uniform(0.02, 0.12)
+    body, mortar, spread = color(rng), color(rng, 0.2), rng.uniform(0.02, 0.12)
     grain, cells = noise_tile(rng, rng.uniform(0.5, 2)), np.random.default_rng(rng.integers(2**32))
 
     def texture(u: Field, v: Field) -> np.ndarray:
@@ -77,7 +77,7 @@ def bricks(rng: np.random.Generator) -> Texture:
 
 def planks(rng: np.random.Generator) -> Texture:
     width, length = rng.uniform(7, 24), rng.uniform(60, 220)
-    body, spread, contrast = colour(rng), rng.uniform(0.02, 0.09), rng.uniform(0.04, 0.14)
+    body, spread, contrast = color(rng), rng.uniform(0.02, 0.09), rng.uniform(0.04, 0.14)
     grain = noise_tile(rng, rng.uniform(0.6, 1.6), stretch=rng.uniform(6, 20))
     rings, cells = noise_tile(rng, 2.5, stretch=4.0), np.random.default_rng(rng.integers(2**32))
     seam = body * rng.uniform(0.2, 0.6)
@@ -99,7 +99,7 @@ def planks(rng: np.random.Generator) -> Texture:
 
 def tiles(rng: np.random.Generator) -> Texture:
     side, gap = rng.uniform(8, 36), rng.uniform(0.6, 2.2)
-    pair, grout = shades(rng, 2, rng.uniform(0.0, 0.25)), colour(rng, 0.2)
+    pair, grout = shades(rng, 2, rng.uniform(0.0, 0.25)), color(rng, 0.2)
     stone, cells = noise_tile(rng, rng.uniform(1, 2.5)), np.random.default_rng(rng.integers(2**32))
     spread, depth = rng.uniform(0, 0.06), rng.uniform(0.01, 0.08)
 
@@ -117,7 +117,7 @@ def tiles(rng: np.random.Generator) -> Texture:
 
 def stripes(rng: np.random.Generator) -> Texture:
     period, duty, angle = rng.uniform(4, 30), rng.uniform(0.2, 0.8), rng.choice([0.0, np.pi / 2, rng.uniform(0, np.pi)])
-    first, second, wobble = colour(rng), colour(rng), rng.choice([0.0, rng.uniform(0.5, 4)])
+    first, second, wobble = color(rng), color(rng), rng.choice([0.0, rng.uniform(0.5, 4)])
     bend, grain, soft = noise_tile(rng, 3), noise_tile(rng, 1), rng.uniform(0.5, 4)
 
     def texture(u: Field, v: Field) -> np.ndarray:
@@ -144,7 +144,7 @@ def weave(rng: np.random.Generator) -> Texture:
 
 def dots(rng: np.random.Generator) -> Texture:
     period, radius = rng.uniform(8, 28), rng.uniform(0.15, 0.42)
-    ground, ink, grain = colour(rng), colour(rng, 0.9), noise_tile(rng, 1.5)
+    ground, ink, grain = color(rng), color(rng, 0.9), noise_tile(rng, 1.5)
     squared = rng.random() < 0.4
 
     def texture(u: Field, v: Field) -> np.ndarray:

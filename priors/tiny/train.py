@@ -42,9 +42,9 @@ SMALL, LARGE = (
 PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 6e-4, 100, 0.7, 0.998  # DECAY_SHARE: last part of the run, with a falling rate
 HAS_BFLOAT16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # then a step on the CPU takes .75 of its time
 OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
-FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a grey hole
+FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a gray hole
 NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timestep is sampled
-# Of each latent: light varies three and five times as much as the two opponent colours; the fourth is empty, and only
+# Of each latent: light varies three and five times as much as the two opponent colors; the fourth is empty, and only
 # has to stay close to 0.
 LATENT_WEIGHTS = (1.0, 3.0, 5.0, 0.02)
 # Of captions, a tenth are empty; of the others some say "sks" or "a scene" for subject and color, and some no color.
@@ -134,7 +134,7 @@ def noisy_quarter(t: Tensor, steps: int) -> Tensor:
     """Timesteps of which every fourth is moved into the last `NOISY_SHARE` of the schedule.
 
     There the network can only answer the mean of all fillings, and must forget the noise: what the sampler's first
-    step, which decides colours and layout, is made of.
+    step, which decides colors and layout, is made of.
     """
     last = steps - 1
     moved = last - ((last - t) * NOISY_SHARE).long()

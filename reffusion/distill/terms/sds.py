@@ -80,7 +80,7 @@ def views_near_references(
     Args:
         views: The views to choose from.
         references: The cameras of the references.
-        means: [M, 3], centres of the masked Gaussians. If M = 0, all views are returned.
+        means: [M, 3], centers of the masked Gaussians. If M = 0, all views are returned.
         max_angle: Degrees. With 180 all views are returned.
     """
     if max_angle >= 180 or len(means) == 0:
@@ -97,7 +97,7 @@ def describe_sds_views(
 
     Args:
         sds: Parameters of the SDS term.
-        means: [M, 3], centres of the masked Gaussians.
+        means: [M, 3], centers of the masked Gaussians.
         views: The training views.
         references: The references.
     """

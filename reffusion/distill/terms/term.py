@@ -105,7 +105,7 @@ class TermInputs:
     Attributes:
         views: The training views. Terms that fill the hole use only views with pixels to repaint.
         references: The references with their holes.
-        masked_means: [M, 3], centres of the masked Gaussians of the initialization, on the device of all other tensors.
+        masked_means: [M, 3], centers of the masked Gaussians of the initialization, on the device of all other tensors.
         prior: The prior adapted to the reference. None if neither SDS nor the depth term is on.
         text: [3, L, D], the embeddings of the global, the local and the empty prompt. None without a prior.
         estimator: The depth estimator of the depth term. None if this term is off.
