@@ -131,11 +131,13 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     scene, runs = write_capture(tmp_path / "scene", "llff", make_truth()), tmp_path / "runs"
     terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
     laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
-    size = {"prior", "iterations", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
+    size = {"prior", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
+    chosen = {"iterations", "repaint", "lr.shape", "lr.epsilon"}  # values that the paper leaves open
+    by_size = {"adversarial.weight"}  # the paper's, for each pixel of a patch
     paper, ours, theirs = (
         by_dotted_name(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
     )
-    assert {name for name, value in ours.items() if value != paper[name]} == {*size, "repaint"}
+    assert {name for name, value in ours.items() if value != paper[name]} == size | chosen | by_size
     assert all(ours[name] == theirs[name] for name in size)
     changed = {stage for stage in terms if terms[stage] != laptop[stage]}
     assert changed == {"masks", "personalize", "initialize", "distill"}
