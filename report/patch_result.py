@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from reffusion.io.arrays import load_labels
-from reffusion.io.edited_scene import repeat_edit
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
+from reffusion.io.scene_edits import repeat_edit
 from report.results import load_receipts
 from report.sheet import stage_folder
 

@@ -18,7 +18,7 @@ from reffusion.io.arrays import load_json, save_json, save_text
 from reffusion.io.images import load_image, replace_image, save_image, save_mask
 from reffusion.io.scene import save_references, save_teaching
 from reffusion.params.base import REFINED_FROM
-from reffusion.params.inpainter import SEEDED
+from reffusion.params.inpainter import SEED_KINDS
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory, pipelines
 from reffusion.prior.model import load_prior
@@ -120,7 +120,7 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
     elif painter := feedforward.load_inpainter(params.inpainter, params.device):
         image = painter.paint(base, exemplar.mask_to_paint(masks.consistent, masks.invent))
         save_candidates(out, [image], {"view": name, "painter": painter.name, "chosen": 0})
-    elif params.inpainter.kind in SEEDED:
+    elif params.inpainter.kind in SEED_KINDS:
         image = inpaint_by_seeds(params, out, base, name, masks)
     else:
         image = inpaint_by_patches(params, out, base, name, space)
@@ -205,21 +205,21 @@ def inpaint_by_seeds(params: Params, out: Path, base: np.ndarray, name: str, mas
         uint8 [H, W, 3].
     """
     hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
-    files = [out / "candidates" / f"{number}.png" for number in params.painted_numbers]
+    files = [out / "candidates" / f"{number}.png" for number in params.candidate_numbers]
     paint = None
     for index in trace.progress(len(files), "reference"):
         if not files[index].exists():
-            paint = paint or load_seeded(params)
-            replace_image(files[index], paint(base, hole, params.seed + params.painted_numbers[index]))
+            paint = paint or load_seed_painter(params)
+            replace_image(files[index], paint(base, hole, params.seed + params.candidate_numbers[index]))
     images = [load_image(file) for file in files]
     seams = inpaint.seam_score(torch.stack([inpaint.to_input(each) for each in images]), torch.from_numpy(hole))
     best = int(seams.argmin())
-    facts = {"painter": painters.seeded_name(params.inpainter), "seams": seams.tolist()}
-    save_candidates(out, images, {"view": name, **facts, "chosen": params.painted_numbers[best]})
+    facts = {"painter": painters.name_seed_painter(params.inpainter), "seams": seams.tolist()}
+    save_candidates(out, images, {"view": name, **facts, "chosen": params.candidate_numbers[best]})
     return images[best]
 
 
-def load_seeded(params: Params) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:
+def load_seed_painter(params: Params) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:
     """Return the function by which Moebius, a pipeline or a program paints: (image, hole, seed) -> image."""
     asked = params.inpainter
     if asked.kind == "moebius":

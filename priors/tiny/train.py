@@ -20,7 +20,7 @@ from diffusers import AutoencoderKL, StableDiffusionInpaintPipeline, UNet2DCondi
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
-from priors.tiny import build, images, surfaces
+from priors.tiny import build, images
 from priors.tiny.photographs import load_photographs
 from priors.tiny.rooms import load_rooms
 from reffusion.io.arrays import save_json
@@ -49,8 +49,6 @@ NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timeste
 LATENT_WEIGHTS = (1.0, 3.0, 5.0, 0.02)
 # Of captions, a tenth are empty; of the others some say "sks" or "a scene" for subject and color, and some no color.
 EMPTY_SHARE, VAGUE_SHARE, PLAIN_SHARE = 0.1, 0.3, 0.1
-# As in windows and whole views of a scene, a crop mostly shows one surface, so that "cropped" tells something.
-CROPPED_SHARE = {True: 0.9, False: 0.2}  # whether the subject is one surface -> share of crops
 USUAL_ENERGY = 0.35  # mean square of the latents, above which a sample's loss is divided by it
 CONTRAST = 0.5  # standard deviation at which the model sees the known pixels of a sample (`reffusion.prior.levels`)
 VALIDATION_CROPS = 32  # held-out crops
@@ -83,17 +81,16 @@ class Pool:
 
     def batch(self, rng: np.random.Generator, side: int, count: int) -> tuple[Tensor, Tensor, list[str]]:
         """Crops [B, 3, side, side] in [-1, 1], masks [B, 1, side, side] (1 = repaint), captions."""
-        crops, masks, drawn = [], [], []
+        crops, masks, choices = [], [], []
         for index in rng.integers(0, len(self.items), count):
-            picture, subject = self.items[index], self.subjects[index]
-            cropped = rng.random() < CROPPED_SHARE[subject in surfaces.PATTERNS]
+            picture, subject, cropped = self.items[index], self.subjects[index], rng.random() < 0.5
             if not cropped:  # at the scale of a whole view at native size, of which a small crop is a part
                 picture = picture.reshape(build.NATIVE, 2, build.NATIVE, 2, 3).mean((1, 3))
             top, left = rng.integers(0, len(picture) - side + 1, 2)
             crop = picture[top : top + side, left : left + side]
             crops.append(crop[:, ::-1] if rng.random() < 0.5 else crop)
             masks.append(images.mask(rng, side))
-            drawn.append((subject, cropped))
+            choices.append((subject, cropped))
         pixels = torch.from_numpy(np.stack(crops).astype(np.float32) / 127.5 - 1).permute(0, 3, 1, 2)
         hidden = torch.from_numpy(np.stack(masks)[:, None].astype(np.float32))
         # The color of the hole as the model sees it: relative to the known pixels, whose mean it sees as 0.
@@ -101,7 +98,7 @@ class Pool:
         colors = [
             images.name_color(each.permute(1, 2, 0)[hole].numpy()) for each, hole in zip(seen, masks, strict=True)
         ]
-        captions = [draw_caption(rng, *what, color) for what, color in zip(drawn, colors, strict=True)]
+        captions = [draw_caption(rng, *what, color) for what, color in zip(choices, colors, strict=True)]
         return pixels, hidden, captions
 
 

@@ -14,9 +14,13 @@ ReferenceKind = Literal[  # in `reference`, `initialize`
     "exemplar", "diffusion", "lama", "migan", "auto", "moebius", "pipeline", "command"
 ]
 FEED_FORWARD = ("lama", "migan")  # the kinds whose network is read from a file
-SEEDED = ("moebius", "pipeline", "command")  # the kinds that draw a picture from a seed, in minutes rather than seconds
+SEED_KINDS = (
+    "moebius",
+    "pipeline",
+    "command",
+)  # the kinds that draw a picture from a seed, in minutes rather than seconds
 PLACEHOLDERS = ("{image}", "{mask}", "{out}")  # in a command: the files that the program reads and the one it writes
-KINDS_WITH = {  # parameter -> the kinds that read it
+KINDS_OF_PARAMETER = {  # parameter -> the kinds that read it
     "weights": (*FEED_FORWARD, "moebius", "pipeline"),
     "command": ("command",),
     "steps": ("moebius", "pipeline"),
@@ -78,7 +82,7 @@ class Inpainter(Settings, Generic[KindT]):
     @model_validator(mode="after")
     def _has_what_its_kind_reads(self) -> Inpainter[KindT]:
         defaults = {name: field.default for name, field in type(self).model_fields.items()}
-        for name, kinds in KINDS_WITH.items():
+        for name, kinds in KINDS_OF_PARAMETER.items():
             if getattr(self, name) != defaults[name] and self.kind not in kinds:
                 raise ValueError(
                     f"kind {self.kind} takes no `{name}`, only {', '.join(kinds)}; `prior` names the diffusion prior"

@@ -45,8 +45,8 @@ class Params(Settings):
     memory_gb: float = memory_field()
 
     @property
-    def painted_numbers(self) -> list[int]:
-        """Return the numbers of the candidates that an inpainter of the kinds `SEEDED` paints.
+    def candidate_numbers(self) -> list[int]:
+        """Return the numbers of the candidates that an inpainter of the kinds `SEED_KINDS` paints.
 
         These are all, or only the one to choose, because each takes minutes. A command without {seed} paints one.
         """

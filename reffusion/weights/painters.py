@@ -76,8 +76,8 @@ def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
     return [Need(str(file), problem, file.stat().st_size, fetched=False)]
 
 
-def seeded_name(inpainter: Inpainter) -> str:
-    """Return the name of an inpainter of the kinds `SEEDED` for tables and messages, without folders."""
+def name_seed_painter(inpainter: Inpainter) -> str:
+    """Return the name of an inpainter of the kinds `SEED_KINDS` for tables and messages, without folders."""
     if inpainter.kind == "moebius":
         return "Moebius"
     if inpainter.kind == "pipeline":

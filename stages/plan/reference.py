@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.views import load_placed_views
-from reffusion.params.inpainter import SEEDED, Inpainter
+from reffusion.params.inpainter import SEED_KINDS, Inpainter
 from reffusion.params.reference import Params, reference_list
 from reffusion.references.files import (
     PAINTED,
@@ -84,10 +84,10 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if params.inpainter.kind == "diffusion":
         has_effect = params.prompt or not params.sampler.guidance
         return [] if has_effect else ["reference.prompt is empty: reference.sampler.guidance has no effect"]
-    if params.inpainter.kind in SEEDED:
+    if params.inpainter.kind in SEED_KINDS:
         unread = params.prompt and (params.inpainter.kind == "moebius" or _is_blind(params.inpainter.command))
         note = f"; the prompt '{params.prompt}' is not read" if unread else ""
-        name, count = painters.seeded_name(params.inpainter), len(params.painted_numbers)
+        name, count = painters.name_seed_painter(params.inpainter), len(params.candidate_numbers)
         return [f"paints the reference by {name}, {count} candidate{'s' if count > 1 else ''}{note}"]
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
