@@ -1,23 +1,19 @@
 """The study of settings of `distill`: each attempt is a valid setting; the scores equal those of the stage's output."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
-from scenes.capture import make_truth, write_capture
 from scenes.stage_runs import run_through_initialize
 
 from benchmarks.studies import attempts as benchmark
-from benchmarks.studies import parts
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
-from runner.resolve import Request, resolve
 from stages import distill
 
 pytestmark = pytest.mark.integration
@@ -82,18 +78,3 @@ def test_a_scene_without_ground_truth_is_refused(initialized_run, tmp_path):
     poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     with pytest.raises(ValueError, match="take another scene"):
         benchmark.load_test_views(poses.parent)
-
-
-@pytest.mark.parametrize("settings", parts.CHANGES.values(), ids=parts.CHANGES)
-def test_every_change_of_a_part_changes_the_profile(tmp_path, settings):
-    request = Request(ROOT, tmp_path, str(write_capture(tmp_path / "scene", "llff", make_truth())), profile="laptop")
-    assert resolve(replace(request, set=settings)).params != resolve(request).params
-
-
-def test_what_parts_are_worth_is_a_difference_to_the_whole_job(tmp_path):
-    whole = {"lpips_vgg_box": 0.2, "psnr_box": 20.0, "psnr_outside": 25.0, "seconds": 300.0}
-    changed = dict.fromkeys(parts.CHANGES, whole | {"psnr_box": 19.5, "seconds": 260.0})
-    found = {"a": {"whole": whole} | changed, "b": {"whole": whole} | dict.fromkeys(parts.CHANGES, whole)}
-    row = parts.tabulate(found).splitlines()[2]
-    assert row.startswith("| no refit | +0.0000±0.0000 | -0.25±") and "| -20±" in row
-    parts.draw(found, tmp_path / "parts.png")

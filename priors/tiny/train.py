@@ -35,10 +35,7 @@ HERE = Path(__file__).resolve().parent
 
 POOL = 500  # images held in memory
 STEPS_PER_IMAGE = 2  # steps per new image, which replaces the oldest; making one costs 1/20 of a step
-SMALL, LARGE = (
-    (32, 24),
-    (64, 8),
-)  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
+SMALL, LARGE = (32, 24), (64, 8)  # (side in px, batch), in turns
 PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 6e-4, 100, 0.7, 0.998  # DECAY_SHARE: last part of the run, with a falling rate
 HAS_BFLOAT16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # then a step on the CPU takes .75 of its time
 OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
@@ -84,8 +81,8 @@ class Pool:
         crops, masks, choices = [], [], []
         for index in rng.integers(0, len(self.items), count):
             picture, subject, cropped = self.items[index], self.subjects[index], rng.random() < 0.5
-            if not cropped:  # at the scale of a whole view at native size, of which a small crop is a part
-                picture = picture.reshape(build.NATIVE, 2, build.NATIVE, 2, 3).mean((1, 3))
+            if not cropped:  # all of it, as a whole view: only then does "cropped" tell what lies where in a hole
+                picture = picture.reshape(side, -1, side, len(picture) // side, 3).mean((1, 3))
             top, left = rng.integers(0, len(picture) - side + 1, 2)
             crop = picture[top : top + side, left : left + side]
             crops.append(crop[:, ::-1] if rng.random() < 0.5 else crop)
@@ -181,7 +178,7 @@ def step_once(
 ) -> float:
     """Training step number `step` of `steps`; returns its loss."""
     rng = np.random.default_rng(seed_for(pool.seed, "batch", step))
-    side, count = LARGE if step % 4 == 3 else SMALL
+    side, count = LARGE if step % 2 else SMALL
     for group in optimiser.param_groups:
         group["lr"] = rate(step, steps)
     error = losses(model, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step)).mean()
