@@ -13,12 +13,13 @@ import pytest
 import yaml
 from scenes.cameras import rotation_along
 
-from benchmarks.studies import composites, compositing, holes, placement, scoring
+from benchmarks.studies import composites, compositing, drawn_places, holes, placement, scoring
 from reffusion.capture import lens
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import save_points
 
 ROOT = Path(__file__).resolve().parent.parent
+CAPTURES = ROOT.parent / "shared" / "data"
 
 WIDTH, HEIGHT = 96, 72
 LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0.03, "p1": 0.002, "p2": -0.001}
@@ -213,3 +214,18 @@ def test_energy_counts_steps_whose_ends_both_lie_in_the_mask():
     assert holes.gradient_energy(picture, mask) == pytest.approx(
         2 / 7
     )  # 2 of the 7 steps (4 horizontal, 3 vertical) in the mask
+
+
+@pytest.mark.skipif(not CAPTURES.is_dir(), reason="needs the captures")
+def test_drawn_places_are_those_of_the_list():
+    garden = placement.load_photographs(CAPTURES / "garden")
+    [places] = drawn_places.draw_places([garden], 20261130, 3, 16)
+    known = {place.name: place for place in drawn_places.load_drawn_places()}
+    assert [known[place.name] for place in places] == places
+
+
+def test_places_of_one_use_are_disjoint():
+    uses = {use: drawn_places.load_drawn_places(use) for use in ("judge", "mend", "sealed")}
+    assert {use: len(places) for use, places in uses.items()} == {"judge": 12, "mend": 6, "sealed": 6}
+    assert len({place.name for places in uses.values() for place in places}) == 24
+    assert composites.select_places("judge", report=False) == uses["judge"]

@@ -17,7 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.studies import compositing, placement, scoring
+from benchmarks.studies import compositing, drawn_places, placement, scoring
 from benchmarks.studies.placement import Place
 from reffusion.io.images import save_image
 from report.job import draw_job
@@ -136,7 +136,8 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
     """Return the places to run.
 
     Args:
-        names: names of places of any set, separated by commas; empty for a whole set.
+        names: names of places of any set, or uses of drawn places (`drawn_places`), separated by commas; empty for a
+            whole set.
         report: True for the set of places that only report, False for the set on which settings are chosen.
 
     Raises:
@@ -144,11 +145,13 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
     """
     if not names:
         return REPORT_PLACES if report else TUNING_PLACES
-    known = {place.name: place for place in (*TUNING_PLACES, *REPORT_PLACES, *NAMED_PLACES)}
+    drawn = drawn_places.load_drawn_places()
+    known = {place.name: (place,) for place in (*TUNING_PLACES, *REPORT_PLACES, *NAMED_PLACES, *drawn)}
+    known |= {use: drawn_places.load_drawn_places(use) for use in ("judge", "mend", "sealed")}
     wrong = [name for name in names.split(",") if name not in known]
     if wrong:
         raise ValueError(f"no place is called {', '.join(wrong)}; there are {', '.join(known)}")
-    return tuple(known[name] for name in names.split(","))
+    return tuple(place for name in names.split(",") for place in known[name])
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
