@@ -1,10 +1,12 @@
 """Places that a seeded generator draws, so that nobody chose them: `python -m benchmarks.studies.drawn_places`.
 
+Captures without points (`fox`, `church`) are first converted from the stage `poses` with --convert.
+
 View, pixel, size, shape and arc are random. A place is rejected only because the object would hang in the air, or would
 have to be hidden by something that stands before it; somebody decides this by looking at the sheets that this program
 writes, on which each place shows the view in which it is placed and the two outermost views. `drawn_places.json` lists
 all places that were drawn, with the use of each: twelve judge the parts of the method ("judge"), six show what is to be
-mended ("mend"), six stay sealed until the end ("sealed"), the others are "spare" or "rejected".
+mended ("mend"), six stay sealed until the end ("sealed"), "spare" ones judge what twelve leave undecided, others are "rejected".
 """
 
 from __future__ import annotations
@@ -24,7 +26,11 @@ from reffusion.io.images import save_image
 
 LIST = Path(__file__).with_name("drawn_places.json")
 # seed -> captures in the order in which they are drawn, number of places of each, and number of the first place
-DRAWS = {20261129: (("garden", "bear", "dinosaur"), 16, 0), 20261130: (("garden", "bear"), 20, 16)}
+DRAWS = {
+    20261129: (("garden", "bear", "dinosaur"), 16, 0),
+    20261130: (("garden", "bear"), 20, 16),
+    20261201: (("fox", "church"), 16, 0),
+}
 COLUMNS, ROWS = (0.12, 0.88), (0.25, 0.9)  # range of the pixel, relative to the photograph's size
 SIZES, ARCS = (0.07, 0.2), (30, 60, 90, 180)  # range of `Place.size`, and values of `Place.arc`
 TRAIN, TEST, NEAR = 34, 6, 30  # `Place.train`, `Place.test`, `Place.near`
@@ -95,9 +101,15 @@ def draw_sheet(capture: placement.Photographs, places: Sequence[Place]) -> np.nd
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of nerfstudio captures")
+    parser.add_argument("--convert", type=Path, help="only write a capture to --out from a folder of the stage poses")
+    parser.add_argument("--seeds", type=int, nargs="*", help="only these draws")
     parser.add_argument("--out", type=Path, default=Path("runs/places"))
     arguments = parser.parse_args()
-    for seed, (names, count, first) in DRAWS.items():
+    if arguments.convert:
+        placement.convert_poses(arguments.convert, arguments.out)
+        return
+    draws = {seed: DRAWS[seed] for seed in arguments.seeds or DRAWS}
+    for seed, (names, count, first) in draws.items():
         captures = [placement.load_photographs(arguments.captures / name) for name in names]
         for capture, places in zip(captures, draw_places(captures, seed, count, first), strict=True):
             name = f"{capture.folder.name}-{seed}"

@@ -7,6 +7,7 @@ camera in this module is a camera-to-world matrix [4, 4]; it looks along +z, wit
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from reffusion.io.arrays import load_json
-from reffusion.io.ply import load_points
+from reffusion.io.ply import load_points, save_points
+from reffusion.io.scene import load_scene
 
 MARGIN = 20  # least distance of the object's axis to the picture's border, px
 FRONT_TOLERANCE = 1.06  # points belong to the front surface up to this factor of the nearest points' depth
@@ -158,6 +160,33 @@ def load_photographs(folder: Path) -> Photographs:
     distortion = np.array([meta.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")])
     size = int(meta["w"]), int(meta["h"])
     return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, load_points(cloud)[0])
+
+
+def convert_poses(poses: Path, out: Path) -> None:
+    """Write a nerfstudio capture from a folder of the stage `poses`, for captures that have no points.
+
+    Args:
+        poses: its folder. Photographs are undistorted there, and at the size of the profile.
+        out: folder of the capture; it must not exist.
+
+    Raises:
+        ValueError: the cameras have different intrinsics.
+    """
+    scene = load_scene(poses)
+    lenses = {(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in scene.cameras.values()}
+    if len(lenses) != 1:
+        raise ValueError(f"{poses}: the photographs have {len(lenses)} different intrinsics; places need one")
+    lens = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), lenses.pop(), strict=True))
+    frames = [
+        {
+            "file_path": f"images/{name}.png",
+            "transform_matrix": (np.linalg.inv(camera.world_to_camera) @ OPENGL).tolist(),
+        }
+        for name, camera in scene.cameras.items()
+    ]
+    shutil.copytree(poses / "images", out / "images")
+    (out / "transforms.json").write_text(json.dumps({**lens, "frames": frames}, indent=1))
+    save_points(out / "sparse_pc.ply", scene.points, scene.point_colors)
 
 
 def save_transforms(capture: Photographs, names: list[str], path: Path) -> None:
