@@ -6,7 +6,8 @@ View, pixel, size, shape and arc are random. A place is rejected only because th
 have to be hidden by something that stands before it; somebody decides this by looking at the sheets that this program
 writes, on which each place shows the view in which it is placed and the two outermost views. `drawn_places.json` lists
 all places that were drawn, with the use of each: twelve judge the parts of the method ("judge"), six show what is to be
-mended ("mend"), six stay sealed until the end ("sealed"), "spare" ones judge what twelve leave undecided, others are "rejected".
+mended ("mend"), six stay sealed until the end ("sealed"), "spare" ones judge the parts that twelve places leave
+undecided, and the others are "rejected".
 """
 
 from __future__ import annotations
