@@ -95,6 +95,7 @@ def run(
     summary = {
         **rows.summarize(scored),
         "reduced": rows.summarize_reduced(scored, longest),
+        "imfine_bbox_v1": rows.summarize_imfine(scored),
         "rendered": f"{len(names)} {kind} views",
         "result": facts["result"],
         "backdrop": facts["backdrop"],

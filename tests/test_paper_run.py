@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,9 +111,9 @@ def small_paper_params(weights: Path) -> dict[str, Settings]:
 
 
 @pytest.fixture(scope="module")
-def stage_outputs(tmp_path_factory):
-    """Run all stages; return a dict from stage to its output folder."""
-    home = tmp_path_factory.mktemp("paper")
+def run_of_paper(tmp_path_factory):
+    """Run all stages; return a dict from stage to its output folder, and the modules of reffusion/ that did work."""
+    home, ran = tmp_path_factory.mktemp("paper"), set()
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
         prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
@@ -124,8 +126,23 @@ def stage_outputs(tmp_path_factory):
     for stage, needs in STAGES.items():
         paths[stage].mkdir(exist_ok=True)
         module = importlib.import_module(f"stages.{stage}")
-        module.run(params[stage], paths[stage], **{need: paths[need] for need in needs})
-    return paths
+        sys.setprofile(lambda frame, event, _: ran.add(frame.f_code) if event == "call" else None)
+        try:
+            module.run(params[stage], paths[stage], **{need: paths[need] for need in needs})
+        finally:
+            sys.setprofile(None)
+    package = str(ROOT / "reffusion") + os.sep
+    files = {code.co_filename for code in ran if code.co_name != "<module>"}  # an import alone is no work
+    return paths, {name.removeprefix(package).removesuffix(".py") for name in files if name.startswith(package)}
+
+
+@pytest.fixture
+def stage_outputs(run_of_paper):
+    return run_of_paper[0]
+
+
+def test_print(run_of_paper):
+    print("\n".join(sorted(run_of_paper[1])))
 
 
 def test_the_consistent_mask_is_the_mask_of_every_term(stage_outputs):

@@ -131,7 +131,7 @@ def fill_reference(
     depth, estimate, words = unprojection.estimate_depth(
         surroundings, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
-    if reference.depth is None:  # a depth map that the scene provides has no ramps
+    if params.depth.hints and reference.depth is None:  # a depth map that the scene provides has no ramps
         near_hole = dilate_by_distance(hole | mask | reference.mask, STEPS_MARGIN)
         depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     inserted = drawn_over = np.zeros_like(hole)

@@ -11,7 +11,7 @@ import numpy as np
 
 from reffusion.background import training_coverage
 from reffusion.io.images import resize_image, resize_nearest
-from reffusion.metrics import consistency, image_metrics
+from reffusion.metrics import consistency, image_metrics, imfine
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.lpips import Lpips
 from reffusion.morphology import dilate
@@ -65,6 +65,8 @@ def score_row(
         if initial is not None:
             scores = image_metrics.score_view(initial, *compared_with)
             row |= {f"initialize_{column}": value for column, value in scores.items()}
+        if scored:
+            row |= imfine.score_view(view.picture, truth.picture, view.mask, models)
         if 0 < longest < max(camera.width, camera.height) and not truth.shows_object:
             pictures = {"": view.picture} | ({"initialize_": initial} if initial is not None else {})
             row |= _score_reduced(pictures, truth.picture, view.mask, models, longest)
@@ -126,6 +128,16 @@ def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any
     return summarize(rows, image_metrics.BOX_COLUMNS, "reduced_") | {
         "protocol": f"renders and truth reduced to {', '.join(sizes)} px (larger side at most {longest} px) by area "
         "averaging, masks by their nearest pixel, before the box is found; all else as at full size"
+    }
+
+
+def summarize_imfine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Summarise the scores by the protocol of `imfine`: "mean", "views" and "protocol", as in `summarize`."""
+    values = {name: [row.get(imfine.PREFIX + name) for row in rows] for name in imfine.COLUMNS}
+    return {
+        "mean": {name: image_metrics.mean(each) for name, each in values.items()},
+        "views": {name: sum(value is not None for value in each) for name, each in values.items()},
+        "protocol": imfine.PROTOCOL,
     }
 
 
