@@ -11,7 +11,7 @@ import numpy as np
 
 from reffusion.background import training_coverage
 from reffusion.io.images import resize_image, resize_nearest
-from reffusion.metrics import consistency, image_metrics, imfine
+from reffusion.metrics import consistency, image_metrics, imfine, leftovers
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.lpips import Lpips
 from reffusion.morphology import dilate
@@ -139,6 +139,22 @@ def summarize_imfine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "views": {name: sum(value is not None for value in each) for name, each in values.items()},
         "protocol": imfine.PROTOCOL,
     }
+
+
+def summarize_leftovers(rows: list[dict[str, Any]], unavailable: str | None) -> dict[str, Any]:
+    """Summarise how much of the removed object is still found in the views.
+
+    Args:
+        unavailable: why the network cannot be used; None if it can.
+
+    Returns:
+        "share": mean over the examined views, None without any; "found": number of views with a leftover; "views":
+        number of examined views; "unavailable"; "protocol".
+    """
+    shares = [row[leftovers.COLUMN] for row in rows if row.get(leftovers.COLUMN) is not None]
+    found = sum(share > 0 for share in shares)
+    about = {"unavailable": unavailable, "protocol": leftovers.PROTOCOL}
+    return {"share": image_metrics.mean(shares), "found": found, "views": len(shares), **about}
 
 
 def to_csv(rows: list[dict[str, Any]]) -> str:

@@ -204,8 +204,8 @@ class Moebius:
 
 MOEBIUS = Moebius()
 
-# Revisions of models of the hub, as other projects' public manifests of these models name them (November 2026; LaMa's file
-# there has the sha256 1faef530...). Of a model that is missing here the revision of the first download is recorded.
+# Revisions of models of the hub, as other projects' public manifests name them (November 2026; LaMa's file has the
+# sha256 1faef530...). Of a model that is missing here the revision of the first download is recorded.
 REVISIONS = {
     SD2: "5f74973cbb64c8568780732c17f43eb269d63a0d",
     SDXL: "115134f363124c53c7d878647567d04daf26e41e",
