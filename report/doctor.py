@@ -61,7 +61,7 @@ class Case(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The picture of an inpainter, uint8 [H, W, 3], and what it took: seconds, loading included, and GB of memory at the peak."""
+    """The picture of an inpainter, uint8 [H, W, 3], and what it took: seconds, loading included, and GB at the peak."""
 
     picture: np.ndarray
     seconds: float
