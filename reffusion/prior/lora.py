@@ -68,7 +68,7 @@ def attach(
             part.add_adapter(adapter)
     set_dropout(prior, False)
     unet, *texts = map(_lora_parameters, _adapted_parts(prior).values())
-    parameters = {"unet": unet, "text": sum(texts, [])}
+    parameters = {"unet": unet, "text": [each for text in texts for each in text]}
     if dropout == 0 and prior.dtype == torch.float32:
         _merge_in_forward(prior.unet)
     return parameters
