@@ -70,7 +70,7 @@ ACTIVE = {
     "masks.vote": "masks/voting masks/consolidation masks/regions",
     "masks.invent": "background/visibility",
     "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
-    "reference.candidates": "references/files references/view_ranking",
+    "reference.candidates": "references/files references/view_ranking depth/inpaint_depth",
     "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
     "personalize.lora.rank": "prior/lora",
     "initialize.start": "initialize/draft initialize/draft_steps initialize/fill initialize/unprojection "
