@@ -122,12 +122,19 @@ def _paint(key: str, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     cuda, small = torch.cuda.is_available(), key == "embedded"
     dtype = torch.float16 if cuda and not small else torch.float32
     prior = load_prior(root() / EMBEDDED if small else PRIORS[key], "cuda" if cuda else "cpu", dtype)
-    options = {"steps": 12, "start": 0.35} if small else {"steps": 25, "start": 0.999}
-    candidates = inpaint.paint(
-        prior, inpaint.to_input(image), torch.from_numpy(hole), prompt="", seeds=[0], guidance=0.0,
-        finest=REFINED_FROM, **options,
-    )  # fmt: skip
-    return inpaint.to_picture(candidates[0])
+    steps, start = (12, 0.35) if small else (25, 0.999)
+    painted = inpaint.paint(
+        prior,
+        inpaint.to_input(image),
+        torch.from_numpy(hole),
+        prompt="",
+        seeds=[0],
+        steps=steps,
+        guidance=0.0,
+        start=start,
+        finest=REFINED_FROM,
+    )
+    return inpaint.to_picture(painted[0])
 
 
 def find_faults(picture: np.ndarray, case: Case) -> list[str]:

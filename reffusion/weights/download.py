@@ -60,7 +60,7 @@ def download_model(name: str, half: bool, only: Sequence[str] = ()) -> Path:
                 )
         folder = Path(snapshot_download(name, revision=info.sha, allow_patterns=chosen))
         main.parent.mkdir(exist_ok=True)
-        main.write_text(info.sha)  # the library does not write it when it downloads an exact revision
+        main.write_text(folder.name)  # the library does not write it when it downloads an exact revision
     except hub.GatedRepoError:
         raise ValueError(
             f"{name} is gated: accept its terms on its page of the hub and log in with `hf auth login`, or {remedy}"
