@@ -66,6 +66,7 @@ class Result(NamedTuple):
     picture: np.ndarray
     seconds: float
     gigabytes: float
+    gpu_gigabytes: float
 
 
 def make_case() -> Case:
@@ -104,7 +105,9 @@ def run_painter(key: str, case: Case) -> Result:
     """Let an inpainter fill the hole, in this process. It raises what the inpainter raises."""
     began = time.monotonic()
     picture = _paint(key, case.image, case.hole)
-    return Result(picture, time.monotonic() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+    seconds, resident = time.monotonic() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    on_gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
+    return Result(picture, seconds, resident / 2**20, on_gpu / 2**30)
 
 
 def _paint(key: str, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
@@ -166,16 +169,17 @@ def examine(keys: list[str], case: Case, out: Path) -> int:
         spawn = multiprocessing.get_context("spawn")  # a fork would inherit this process' memory
         try:
             with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-                picture, seconds, gigabytes = pool.submit(run_painter, key, case).result()
+                result = pool.submit(run_painter, key, case).result()
         except BrokenProcessPool:
             words = "its process was killed, probably for lack of memory"
         except Exception as error:
             words = " ".join(str(error).split())
         else:
-            faults = find_faults(picture, case)
-            psnr = cv2.PSNR(picture[case.hole], case.truth[case.hole])
-            words = f"{seconds:.1f} s, {gigabytes:.1f} GB, {psnr:.1f} dB{find_revision(key)}"
-            panels.append(picture)
+            faults = find_faults(result.picture, case)
+            psnr = cv2.PSNR(result.picture[case.hole], case.truth[case.hole])
+            on_gpu = f" ({result.gpu_gigabytes:.1f} GB on the GPU)" if result.gpu_gigabytes else ""
+            words = f"{result.seconds:.1f} s, {result.gigabytes:.1f} GB{on_gpu}, {psnr:.1f} dB{find_revision(key)}"
+            panels.append(result.picture)
             if not faults:
                 print(f"{NAMES[key]:24} plausible: {words}; picture {len(panels)}", flush=True)
                 continue

@@ -68,7 +68,7 @@ WEIGHTS = {
 # the method. Another module that runs there is a step that the paper does not have, or lacks a row.
 ACTIVE = {
     "masks.vote": "masks/voting masks/consolidation masks/regions",
-    "masks.invent": "background/visibility",
+    "masks.invent": "background/model background/visibility",
     "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
     "reference.candidates": "references/files references/view_ranking depth/inpaint_depth",
     "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
