@@ -209,7 +209,9 @@ def test_imfine_scores_are_those_of_an_independent_implementation(shape):
 
 def test_imfine_scores_of_a_run_are_those_of_its_saved_pictures(finished_job):
     out = finished_job / "evaluate"
-    found = load_json(out / "metrics.json")["imfine_bbox_v1"]
+    metrics = load_json(out / "metrics.json")
+    found = metrics["imfine_bbox_v1"]
+    assert metrics["leftovers"]["share"] is None and "make weights" in metrics["leftovers"]["unavailable"]
     masks = {"view0": np.s_[10:30, 5:35], "view2": np.s_[4:24, 20:48]}  # view1 has an empty mask
     scores = []
     for name, place in masks.items():
