@@ -25,6 +25,7 @@
 ## make data=FOLDER study         after compare, or with scene=X: paired clips for people to judge
 ## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing;
 ##                                painter=moebius: those of this painter too
+## make doctor                    let each inpainter on this machine fill one hole: time, memory, runs/doctor.png
 ## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
 ##                                -360, -seen, -photos, -behind, -beside, -table, -corner, -grass, -insert, -outpaint,
 ##                                -mono, -pair, -past, -sparse, each also with -N
@@ -76,8 +77,8 @@ options := $(where) profile budget set trust keep
 cluster := engine address cores
 
 .PHONY: help setup named ready all $(STAGES) plan check compare report study app mask view turntable patch export verify \
-	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test test-fast fuzz bench stability gpu \
-	gpu-check lint docs
+	clean gc spinnerf batch weights doctor demo prior prior-report sds-variance adapted sparse test test-fast fuzz bench stability \
+	gpu gpu-check lint docs
 .DELETE_ON_ERROR:
 
 help:
@@ -200,6 +201,9 @@ gc: setup
 spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
 	$(if $(filter spinnerf,$@),@$(PY) data/spinnerf.py --data="$$data")
 	@$(RUN) batch --data="$$data" $(call flags,$(filter-out scene,$(options)) $(cluster))
+
+doctor: setup
+	@$(RUN) doctor
 
 weights: setup
 	@$(RUN) weights $(call flags,$(filter-out set,$(options)) offline) \

@@ -32,6 +32,7 @@ COMMANDS = {
     "batch-page": ("report.batch", "draw the page of a batch again"),
     "study": ("report.study", "make paired clips for people to judge"),
     "study-votes": ("report.votes", "count the answers of a study"),
+    "doctor": ("report.doctor", "does each 2D inpainter on this machine work? time, memory, and a sheet"),
     "weights": ("runner", "fetch the weights that a profile needs"),
     "verify": ("runner", "hash all results: are they as they were made?"),
     "clean": ("runner", "remove the results of a scene"),

@@ -22,7 +22,7 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_object_mask, load_scene
 from reffusion.kernels.compiled import side_by_side, views_at_once
-from reffusion.metrics import image_metrics, lpips, rows
+from reffusion.metrics import image_metrics, leftovers, lpips, rows
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.view_renders import ViewRenderer, ViewRenders
 from reffusion.params.evaluate import Params
@@ -68,6 +68,8 @@ def run(
     models = {net: model for net, (model, _) in loaded.items() if model}
     longest = reduced_side(params, raw_masks)
     unseen = unseen_by_training(scene, fit, raw_masks, masks, params.device)
+    segmenter, no_segmenter = leftovers.load_segmenter()
+    examined = names[:: -(-len(names) // leftovers.MOST_VIEWS)] if segmenter and facts["result"] != "fit" else ()
     has_truth = kind == "test" and not (masks and load_json(masks / "facts.json").get("kept"))
 
     def evaluate_view(name: str) -> tuple[RenderedView, dict[str, Any]]:
@@ -76,9 +78,12 @@ def run(
         renders = renderer.render(camera, load_object_mask(camera, raw_masks, masks), picture)
         save_renders(out, renders, picture)
         truth = rows.GroundTruth(picture, has_object_mask(raw_masks, masks, name), unseen.get(name))
-        return renders.result, rows.score_row(
-            renders.result, renders.by_stage.get("initialize"), truth, models, longest
-        )
+        row = rows.score_row(renders.result, renders.by_stage.get("initialize"), truth, models, longest)
+        if segmenter and name in examined and renders.result.mask.any():
+            result = renders.result
+            share = leftovers.measure_share(segmenter, renders.by_stage["fit"], result.picture, result.mask)
+            row[leftovers.COLUMN] = share
+        return renders.result, row
 
     scored: list[dict[str, Any]] = []
     previous = None
@@ -95,6 +100,8 @@ def run(
     summary = {
         **rows.summarize(scored),
         "reduced": rows.summarize_reduced(scored, longest),
+        "imfine_bbox_v1": rows.summarize_imfine(scored),
+        "leftovers": rows.summarize_leftovers(scored, no_segmenter),
         "rendered": f"{len(names)} {kind} views",
         "result": facts["result"],
         "backdrop": facts["backdrop"],

@@ -5,6 +5,7 @@ Masked Gaussians stay in their region, runs resume bit for bit, and errors name 
 """
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -237,6 +238,19 @@ def test_densification_needs_large_gradients_and_is_bounded(prior, text, tmp_pat
     assert count_new("small gradients", 1e-9) == 0
     assert count_new("large gradients", 1e3) == round(0.25 * masked)
     assert count_new("never", 1e3, every=0) == 0
+
+
+def test_a_gaussian_is_split_from_a_share_of_the_cameras_extent_on_as_in_3dgs(prior, text, tmp_path):
+    """The extent of these cameras is 0.055: a new Gaussian of 0.005 is large by it, and small beside the distance 1."""
+    start = random_wall()[0]
+    start = replace(start, log_scales=torch.full_like(start.log_scales, math.log(0.005)))
+    views, smallest = [train_view("a"), train_view("b", 0.1)], {}
+    for unit in ("distance", "cameras"):
+        changes = {"sds": {"weight": 1e3}, "densify": {"every": 2}, "lr": {"means_unit": unit, "shape": 0}}
+        settings = with_changes(SETTINGS, iterations=4, confined=False, adversarial=OFF, reference=OFF, **changes)
+        after, labels = run_distill(tmp_path / unit, prior, text, settings, views, start)
+        smallest[unit] = float(after.log_scales[labels].exp().min())
+    assert smallest["distance"] == pytest.approx(0.005) and smallest["cameras"] == pytest.approx(0.005 / 1.6)
 
 
 def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path):

@@ -5,10 +5,14 @@ import json
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scenes.cameras import make_camera, make_scene
+from scipy import ndimage
+from skimage.metrics import structural_similarity
 
 from reffusion import seeding
 from reffusion.background import training_coverage
@@ -17,7 +21,7 @@ from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
-from reffusion.metrics import image_metrics, rows
+from reffusion.metrics import image_metrics, imfine, rows
 from reffusion.morphology import dilate
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, MaskSet, Scene, Similarity
@@ -171,6 +175,52 @@ def test_scores_are_those_of_the_saved_pictures(finished_job):
     box_scores = [float(row["psnr_box"]) for row in table if row["psnr_box"]]
     assert np.mean(box_scores) == pytest.approx(summary["mean"]["psnr_box"])
     assert load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
+
+
+def score_as_freeinpaint_does(picture, truth, mask):
+    """Compute PSNR and SSIM by the protocol imfine_bbox_v1 with Pillow, SciPy and scikit-image."""
+    resize = lambda array, how: np.asarray(Image.fromarray(array).resize((504, 280), how))
+    islands = ndimage.label(resize(mask.astype(np.uint8) * 255, Image.Resampling.NEAREST) > 0, np.ones((3, 3)))[0]
+    largest = max(ndimage.find_objects(islands), key=lambda box: (islands[box] > 0).sum())
+    picture, truth = (resize(each, Image.Resampling.LANCZOS)[largest].astype(float) for each in (picture, truth))
+    luma = [np.round(each @ [0.299, 0.587, 0.114]) for each in (picture, truth)]
+    window = dict(gaussian_weights=True, sigma=1.5, win_size=11, use_sample_covariance=False)
+    ssim = structural_similarity(*luma, data_range=255, **window)
+    return 10 * np.log10(1 / (np.mean((picture - truth) ** 2) / 255**2 + 1e-8)), ssim
+
+
+@pytest.mark.parametrize("shape", [(280, 504), (420, 630), (90, 160)], ids=["that size", "larger", "smaller"])
+def test_imfine_scores_are_those_of_an_independent_implementation(shape):
+    rng = np.random.default_rng(0)
+    truth = cv2.resize(rng.integers(0, 256, (9, 16, 3), np.uint8), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    noisy = np.clip(truth + rng.normal(0, 12, truth.shape), 0, 255).astype(np.uint8)
+    mask, (height, width) = np.zeros(shape, bool), shape
+    mask[height // 5 : height // 2, width // 6 : width // 2] = True
+    mask[-height // 8 :, -width // 6 :] = True  # a smaller island, which the protocol leaves out
+    found = imfine.score_view(noisy, truth, mask, {})
+    psnr, ssim = score_as_freeinpaint_does(noisy, truth, mask)
+    assert found == {
+        "imfine_bbox_v1_psnr": pytest.approx(psnr, abs=1e-6),
+        "imfine_bbox_v1_ssim": pytest.approx(ssim, abs=1e-6),
+    }
+    assert imfine.score_view(noisy, truth, mask & False, {}) == {}
+    assert imfine.score_view(truth, truth, mask, {})["imfine_bbox_v1_psnr"] == pytest.approx(80)
+
+
+def test_imfine_scores_of_a_run_are_those_of_its_saved_pictures(finished_job):
+    out = finished_job / "evaluate"
+    metrics = load_json(out / "metrics.json")
+    found = metrics["imfine_bbox_v1"]
+    assert metrics["leftovers"]["share"] is None and "make weights" in metrics["leftovers"]["unavailable"]
+    masks = {"view0": np.s_[10:30, 5:35], "view2": np.s_[4:24, 20:48]}  # view1 has an empty mask
+    scores = []
+    for name, place in masks.items():
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[place] = True
+        truth = load_image(finished_job / "poses" / "images" / f"{name}.png")
+        scores.append(score_as_freeinpaint_does(load_image(out / "renders" / f"{name}.png"), truth, mask)[0])
+    assert found["views"] == {"psnr": 2, "ssim": 2, "lpips_alex": 0}
+    assert found["mean"]["psnr"] == pytest.approx(np.mean(scores)) and found["mean"]["lpips_alex"] is None
 
 
 def test_the_scene_is_exported_in_its_own_frame(finished_job):

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import torch
 from scenes import wall_scene
 from scenes.networks import small_depth_model
 from scenes.simulated_gpu import has_gpu
+from test_paper import DOC, parse_rows
 
 from benchmarks.gpu import full_size
 from reffusion.depth import monocular
@@ -60,6 +63,27 @@ WEIGHTS = {
     "personalize": {"prior": "sd2"},
     "initialize": {"depth.model": "depth"},
     "distill": {"prior": "sd2", "depth.model": "depth"},
+}
+# Row of the table in docs/paper.md -> the modules of reffusion/ that do its work in `paper`, of the packages that hold
+# the method. Another module that runs there is a step that the paper does not have, or lacks a row.
+ACTIVE = {
+    "masks.vote": "masks/voting masks/consolidation masks/regions",
+    "masks.invent": "background/model background/visibility",
+    "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
+    "reference.candidates": "references/files references/view_ranking depth/inpaint_depth",
+    "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
+    "personalize.lora.rank": "prior/lora",
+    "initialize.start": "initialize/draft initialize/draft_steps initialize/fill initialize/unprojection "
+    "initialize/origins",
+    "initialize.depth.model": "depth/monocular depth/estimates depth/alignment depth/background_depth depth/bilateral "
+    "depth/completion depth/solverlog",
+    "distill.iterations": "distill/inputs distill/loop distill/train_view distill/terms/term distill/overlap_worker",
+    "distill.confined": "distill/regions",
+    "distill.densify.every": "distill/densification",
+    "distill.sds.weight": "distill/sds distill/terms/sds distill/display_range prior/levels",
+    "distill.depth.weight": "distill/terms/depth distill/depth_estimator",
+    "distill.adversarial.weight": "distill/terms/adversarial distill/adversary distill/discriminator",
+    "distill.reconstruction.reaches": "distill/terms/reconstruction fit/exposure",
 }
 STANDS_FOR = {"sd2": published.SD2, "sdxl": published.SDXL, "depth": "depth-anything/Depth-Anything-V2-Small-hf"}
 # On a GPU the profile's device and dtypes stay: bfloat16 for training, float16 for inpainting and distillation.
@@ -109,9 +133,9 @@ def small_paper_params(weights: Path) -> dict[str, Settings]:
 
 
 @pytest.fixture(scope="module")
-def stage_outputs(tmp_path_factory):
-    """Run all stages; return a dict from stage to its output folder."""
-    home = tmp_path_factory.mktemp("paper")
+def run_of_paper(tmp_path_factory):
+    """Run all stages; return a dict from stage to its output folder, and the modules of reffusion/ that did work."""
+    home, ran = tmp_path_factory.mktemp("paper"), set()
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
         prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
@@ -124,8 +148,30 @@ def stage_outputs(tmp_path_factory):
     for stage, needs in STAGES.items():
         paths[stage].mkdir(exist_ok=True)
         module = importlib.import_module(f"stages.{stage}")
-        module.run(params[stage], paths[stage], **{need: paths[need] for need in needs})
-    return paths
+        if stage != "evaluate":  # which only measures
+            sys.setprofile(lambda frame, event, _: ran.add(frame.f_code) if event == "call" else None)
+        try:
+            module.run(params[stage], paths[stage], **{need: paths[need] for need in needs})
+        finally:
+            sys.setprofile(None)
+    package = str(ROOT / "reffusion") + os.sep
+    # Imports, terms that are built and found to be off, and what is read are no work.
+    files = {code.co_filename for code in ran if code.co_name not in ("<module>", "build", "from_arrays")}
+    return paths, {name.removeprefix(package).removesuffix(".py") for name in files if name.startswith(package)}
+
+
+@pytest.fixture
+def stage_outputs(run_of_paper):
+    return run_of_paper[0]
+
+
+def test_nothing_runs_that_the_table_of_the_docs_does_not_list(run_of_paper):
+    """The modules that do work from `masks` to `finish` are those of `ACTIVE`, each by a row that the paper has."""
+    says = {name: row[0] for name, row in parse_rows(DOC.read_text()).items()}
+    assert [row for row in ACTIVE if says.get(row, "no") == "no"] == []
+    listed = {module for modules in ACTIVE.values() for module in modules.split()}
+    packages = {module.split("/")[0] for module in listed} | {"background", "clicks", "fit", "inpaint", "references"}
+    assert {module for module in run_of_paper[1] if module.split("/")[0] in packages} == listed
 
 
 def test_the_consistent_mask_is_the_mask_of_every_term(stage_outputs):

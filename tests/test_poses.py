@@ -435,6 +435,10 @@ def test_preview_is_fast_and_describes_the_run(tmp_path):
     assert notes[0] == "4 photographs build the scene; 2 are kept to test it"
     assert notes[1] == f"the poses come from {Path('sparse/0/images.bin')}"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
+    assert notes[3].startswith(f"the scene runs at {WIDTH}x{HEIGHT} px, the size of images_4, not at the 1600 px of ")
+    write_spin_nerf(tmp_path / "full")
+    for longest, scene in ((WIDTH, "s"), (1600, "full")):
+        assert "the scene runs at" not in " ".join(plan.preview(poses.Params(longest=longest), tmp_path / scene))
     write_capture(tmp_path / "t", "transforms", make_truth())
     assert "the photographs need no undistortion: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
     write_pictures(tmp_path / "p", ["a", "b", "c"])

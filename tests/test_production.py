@@ -31,11 +31,16 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
-def sdxl_prior(tmp_path_factory):
-    """Return a small prior with the architecture of SDXL, loaded from a folder that diffusers wrote."""
+def sdxl_folder(tmp_path_factory):
+    """Return a folder that diffusers wrote, with a small prior with the architecture of SDXL."""
     folder = tmp_path_factory.mktemp("sdxl")
     pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
-    return load_prior(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sdxl_prior(sdxl_folder):
+    return load_prior(sdxl_folder)
 
 
 @pytest.fixture
@@ -80,9 +85,34 @@ def test_sdxl_paints_a_reference(sdxl_prior):
     assert not torch.equal(other, painted)
 
 
-def test_sdxl_is_refused_where_it_cannot_work(sdxl_prior):
-    with pytest.raises(ValueError, match=r"reference.prior"):
-        lora.attach(sdxl_prior, 4, 4.0, 0.0, "attention", 0)
+def test_sdxl_learns_a_lora_on_its_unet_and_both_text_encoders(sdxl_folder, tmp_path):
+    """What is saved changes a fresh SDXL as it changed the trained one, here and in diffusers' own pipeline."""
+    prior = load_prior(sdxl_folder)
+    texts = Prompts().texts
+    before = diffusion.embed_text(prior, texts).detach()
+    _, optimizer, training = F.trainer(prior, 5)
+    losses = [train_step(prior, optimizer, [F.reference(32)], training, step) for step in range(3)]
+    lora.set_dropout(prior, False)
+    assert torch.tensor(losses).isfinite().all() and {part.split(".")[0] for part in lora.state(prior)} == {
+        "unet",
+        "text",
+        "text_2",
+    }
+    changed = [name for name, value in lora.state(prior).items() if "lora_B" in name and value.any()]
+    assert {name.split(".")[0] for name in changed} == {"unet", "text", "text_2"}
+    lora.save(prior, tmp_path)
+    fresh = lora.merge(load_prior(sdxl_folder), tmp_path)
+    text = diffusion.embed_text(prior, texts).detach()
+    assert (text - before).abs().max() > 1e-5 and torch.allclose(diffusion.embed_text(fresh, texts), text, atol=1e-5)
+    noisy, condition, at = draw_normal(1, 4, 16, 16), draw_normal(1, 5, 16, 16, seed=1), torch.tensor([300])
+    with torch.no_grad():
+        predict = lambda each: diffusion.raw_prediction(each, noisy, at, condition, text[:1])
+        assert torch.allclose(predict(fresh), predict(prior), atol=1e-4)
+        assert (predict(prior) - predict(load_prior(sdxl_folder))).abs().max() > 1e-5
+    pipe = pipeline(load_prior(sdxl_folder))
+    pipe.load_lora_weights(tmp_path, weight_name=lora.LORA_FILE)
+    hidden = pipe.encode_prompt(texts[0], device="cpu")[0]
+    assert torch.allclose(hidden[0], text[0, :-1], atol=1e-5)
 
 
 # ----------------------------------------------------------------------------------------------------- parts of a batch

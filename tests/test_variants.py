@@ -154,8 +154,12 @@ def by_dotted_name(params):
 
 def test_the_papers_profile_takes_every_variant(finished_capture):
     scene, runs = finished_capture
-    for variant in ("lift_perceptual_diffusion", "sds_plain"):
-        resolve(Request(ROOT, runs, str(scene), profile="paper", variant=variant))
+    requests = [
+        Request(ROOT, runs, str(scene), profile="paper", variant=v) for v in ("lift_perceptual_diffusion", "sds_plain")
+    ]
+    lifted, plain = (resolve(request).params for request in requests)
+    assert lifted["lift"]["guidance"] > 0 and lifted["lift"]["prompt"], "guidance needs a prompt"
+    assert "sks" not in str(plain["distill"]["prompts"]), "an unadapted prior knows sks as a rifle"
 
 
 # ------------------------------------------------------------------------------------------ what the terms may reach

@@ -270,11 +270,18 @@ class Hub(http.server.BaseHTTPRequestHandler):
         if "/tree/" in path:
             return self._answer(200, json.dumps(described).encode(), Content_Type="application/json")
         if path.startswith("/api/"):
-            facts = {"id": model, "sha": self.STATE, "siblings": described, "private": False, "tags": []}
+            asked = path.partition("/revision/")[2]
+            if asked == "f" * 40:
+                return self._answer(404, X_Error_Code="RevisionNotFound", X_Error_Message="Revision Not Found")
+            facts = {"id": model, "sha": asked or self.STATE, "siblings": described, "private": False, "tags": []}
             return self._answer(200, json.dumps(facts).encode(), Content_Type="application/json")
         name = path.partition("/resolve/")[2].partition("/")[2]
         body = files[name]
-        headers = {"ETag": f'"{digest(body)}"', "X_Repo_Commit": self.STATE, "X_Linked_Etag": f'"{digest(body)}"'}
+        headers = {
+            "ETag": f'"{digest(body)}"',
+            "X_Repo_Commit": path.partition("/resolve/")[2].partition("/")[0],
+            "X_Linked_Etag": f'"{digest(body)}"',
+        }
         if name in self.spoilt:
             body = body[:-1] + bytes([body[-1] ^ 1])
         first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").split("-")[0])
@@ -345,6 +352,22 @@ def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_pa
     assert "acme/gated is gated: accept its terms" in gated and "hf auth login" in gated
     assert "acme/gone: the hub has no such model" in gone
     assert "the hub has no such model" in moved and "stable-diffusion-v1-5/stable-diffusion-inpainting" in moved
+
+
+def test_a_revision_is_pinned_or_that_of_the_first_download(tmp_path, hub):
+    address, handler = hub
+    handler.models[published.SD2] = handler.models["acme/paint"]
+    fetch = lambda: [
+        Path(line) for line in fetch_models("acme/paint", published.SD2, HF_ENDPOINT=address, HF_HOME=str(tmp_path))
+    ]
+    first, pinned = fetch()
+    assert (first.name, pinned.name) == ("a" * 40, published.REVISIONS[published.SD2])
+    handler.STATE = "b" * 40  # the model has a newer revision now
+    (first / "model_index.json").unlink()
+    assert fetch() == [first, pinned] and (first / "model_index.json").exists()
+    (first.parents[1] / "refs" / "main").write_text("f" * 40)
+    (message,) = fetch_models("acme/paint", HF_ENDPOINT=address, HF_HOME=str(tmp_path))
+    assert "acme/paint: the hub has no revision ffff" in message
 
 
 @pytest.mark.integration

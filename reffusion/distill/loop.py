@@ -115,7 +115,9 @@ def distill(
         ValueError: A term lacks an input: a prior, a depth estimator, or a hole in a reference.
     """
     objective = build_objective(inputs, settings)
-    rates = rates or rates_of(settings.lr, [view.camera for view in inputs.views])
+    cameras = [view.camera for view in inputs.views]
+    rates = rates or rates_of(settings.lr, cameras)
+    size_unit = cameras_extent(cameras) if settings.lr.means_unit == "cameras" else 1.0
     optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = build_region(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.start_or_resume(optimizer, objective, trace.load_checkpoint(folder))
@@ -129,7 +131,7 @@ def distill(
         run.step = done = step + 1
         if _densifies_after(settings, done):
             draws = seeding.generator(settings.seed, "distill", "densify", done)
-            densify_masked(optimizer, int(masked.sum()), settings.densify, draws)
+            densify_masked(optimizer, int(masked.sum()), settings.densify, size_unit, draws)
         average(optimizer, settings, done)
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~has_changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))

@@ -181,7 +181,7 @@ def control_density(
         done: number of steps done.
     """
     schedule, progress = settings.densify, done / settings.iterations
-    if not schedule.start <= progress < schedule.stop:
+    if not schedule.start < progress < schedule.stop:
         return
     period = round(schedule.reset_every * settings.iterations)
     if done % schedule.every == 0:

@@ -131,7 +131,7 @@ def fill_reference(
     depth, estimate, words = unprojection.estimate_depth(
         surroundings, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
-    if reference.depth is None:  # a depth map that the scene provides has no ramps
+    if params.depth.hints and reference.depth is None:  # a depth map that the scene provides has no ramps
         near_hole = dilate_by_distance(hole | mask | reference.mask, STEPS_MARGIN)
         depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     inserted = drawn_over = np.zeros_like(hole)
@@ -150,9 +150,9 @@ def fill_reference(
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
     print(f"depth of reference {camera.name}: {words}")
     filled = hole & ~inserted & ~ceded
-    # At a step no seam has to be closed: the surface beyond it is another one.
-    overlap = dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(depth)
-    pixels = filled | overlap | drawn_over
+    pixels = filled | drawn_over
+    if params.overlap:  # at a step no seam has to be closed: the surface beyond it is another one
+        pixels |= dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(depth)
     draft = unprojection.add_surface(
         draft, reference, depth, pixels, background, sheets, EXTRA_VIEW if farthest else REFERENCE
     )

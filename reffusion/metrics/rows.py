@@ -11,7 +11,7 @@ import numpy as np
 
 from reffusion.background import training_coverage
 from reffusion.io.images import resize_image, resize_nearest
-from reffusion.metrics import consistency, image_metrics
+from reffusion.metrics import consistency, image_metrics, imfine, leftovers
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.lpips import Lpips
 from reffusion.morphology import dilate
@@ -65,6 +65,8 @@ def score_row(
         if initial is not None:
             scores = image_metrics.score_view(initial, *compared_with)
             row |= {f"initialize_{column}": value for column, value in scores.items()}
+        if scored:
+            row |= imfine.score_view(view.picture, truth.picture, view.mask, models)
         if 0 < longest < max(camera.width, camera.height) and not truth.shows_object:
             pictures = {"": view.picture} | ({"initialize_": initial} if initial is not None else {})
             row |= _score_reduced(pictures, truth.picture, view.mask, models, longest)
@@ -127,6 +129,32 @@ def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any
         "protocol": f"renders and truth reduced to {', '.join(sizes)} px (larger side at most {longest} px) by area "
         "averaging, masks by their nearest pixel, before the box is found; all else as at full size"
     }
+
+
+def summarize_imfine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Summarise the scores by the protocol of `imfine`: "mean", "views" and "protocol", as in `summarize`."""
+    values = {name: [row.get(imfine.PREFIX + name) for row in rows] for name in imfine.COLUMNS}
+    return {
+        "mean": {name: image_metrics.mean(each) for name, each in values.items()},
+        "views": {name: sum(value is not None for value in each) for name, each in values.items()},
+        "protocol": imfine.PROTOCOL,
+    }
+
+
+def summarize_leftovers(rows: list[dict[str, Any]], unavailable: str | None) -> dict[str, Any]:
+    """Summarise how much of the removed object is still found in the views.
+
+    Args:
+        unavailable: why the network cannot be used; None if it can.
+
+    Returns:
+        "share": mean over the examined views, None without any; "found": number of views with a leftover; "views":
+        number of examined views; "unavailable"; "protocol".
+    """
+    shares = [row[leftovers.COLUMN] for row in rows if row.get(leftovers.COLUMN) is not None]
+    found = sum(share > 0 for share in shares)
+    about = {"unavailable": unavailable, "protocol": leftovers.PROTOCOL}
+    return {"share": image_metrics.mean(shares), "found": found, "views": len(shares), **about}
 
 
 def to_csv(rows: list[dict[str, Any]]) -> str:

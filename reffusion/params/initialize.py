@@ -19,8 +19,8 @@ class Depth(Settings):
     # The paper aligns the model's depth and unprojects it in the whole hole.
     hints: bool = Field(
         True,
-        description="in the hole, keep depth that other views confirm, and continue planes and mirror images; off: the "
-        "estimate holds in the whole hole",
+        description="in the hole, keep depth that other views confirm, and continue planes and mirror images; sharpen "
+        "ramps to steps; off: the estimate holds in the whole hole",
     )
 
 

@@ -1,4 +1,4 @@
-"""LoRA on UNet and text encoder (RefFusion section 4.1): attach, train, save for diffusers, merge.
+"""LoRA on UNet and text encoders (RefFusion section 4.1): attach, train, save for diffusers, merge.
 
 This is the only module that imports peft.
 
@@ -35,7 +35,7 @@ CONVOLUTIONS = (
 def attach(
     prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int
 ) -> dict[str, list[nn.Parameter]]:
-    """Attach new LoRA layers to UNet and text encoder, in place.
+    """Attach new LoRA layers to UNet and text encoder, for SDXL to both text encoders, in place.
 
     Args:
         prior: The diffusion prior.
@@ -45,18 +45,15 @@ def attach(
         seed: Seed of the initial values.
 
     Returns:
-        {"unet": parameters, "text": parameters}, float32, requiring gradients.
+        {"unet": parameters, "text": parameters of the text encoders}, float32, requiring gradients.
 
     Raises:
-        ValueError: The prior is SDXL, or `layers` is unknown.
+        ValueError: `layers` is unknown.
     """
     from peft import LoraConfig
 
-    if prior.text_encoder_2 is not None:
-        raise ValueError("SDXL cannot be adapted here: it paints references (reference.prior); adapt an SD2-type prior")
     if layers not in ("attention", "qkv", "attention+conv"):
         raise ValueError(f"layers must be 'attention', 'qkv' or 'attention+conv', not {layers!r}")
-    assert prior.text_encoder is not None
     targets, text_targets = ATTENTION, TEXT_ATTENTION
     if layers == "qkv":
         targets, text_targets = ATTENTION[:-1], TEXT_ATTENTION[:-1]
@@ -64,15 +61,23 @@ def attach(
         targets = ATTENTION + CONVOLUTIONS
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        for part, names in ((prior.unet, targets), (prior.text_encoder, text_targets)):
+        for label, part in _adapted_parts(prior).items():
+            names = targets if label == "unet" else text_targets
             # peft annotates lora_alpha as int, and only divides it by the rank.
             adapter = LoraConfig(r=rank, lora_alpha=cast(int, alpha), lora_dropout=dropout, target_modules=list(names))
             part.add_adapter(adapter)
     set_dropout(prior, False)
-    parameters = {"unet": _lora_parameters(prior.unet), "text": _lora_parameters(prior.text_encoder)}
+    unet, *texts = map(_lora_parameters, _adapted_parts(prior).values())
+    parameters = {"unet": unet, "text": [each for text in texts for each in text]}
     if dropout == 0 and prior.dtype == torch.float32:
         _merge_in_forward(prior.unet)
     return parameters
+
+
+def _adapted_parts(prior: Prior) -> dict[str, nn.Module]:
+    """Return the networks that LoRA adapts by the labels of `state`: the UNet first, then the text encoders."""
+    parts = {"unet": prior.unet, "text": prior.text_encoder, "text_2": prior.text_encoder_2}
+    return {label: part for label, part in parts.items() if part is not None}
 
 
 def _merge_in_forward(part: nn.Module) -> None:
@@ -117,7 +122,7 @@ def state(prior: Prior) -> dict[str, Tensor]:
     """Return copies of the LoRA weights by name, for checkpoints."""
     return {
         f"{label}.{name}": parameter.detach().cpu().clone()
-        for label, part in (("unet", prior.unet), ("text", prior.text_encoder))
+        for label, part in _adapted_parts(prior).items()
         for name, parameter in part.named_parameters()
         if "lora_" in name
     }
@@ -125,15 +130,15 @@ def state(prior: Prior) -> dict[str, Tensor]:
 
 def load_state(prior: Prior, state: dict[str, Tensor]) -> None:
     """Restore the weights returned by `state`, into layers attached by `attach`."""
-    for label, part in (("unet", prior.unet), ("text", prior.text_encoder)):
+    for label, part in _adapted_parts(prior).items():
         for name, parameter in part.named_parameters():
             if "lora_" in name:
                 parameter.data.copy_(state[f"{label}.{name}"])
 
 
 def set_dropout(prior: Prior, active: bool) -> None:
-    """Switch UNet and text encoder to training mode, with LoRA dropout (True), or to evaluation mode (False)."""
-    for part in (prior.unet, prior.text_encoder):
+    """Switch UNet and text encoders to training mode, with LoRA dropout (True), or to evaluation mode (False)."""
+    for part in _adapted_parts(prior).values():
         part.train(active)
 
 
@@ -144,16 +149,14 @@ def save(prior: Prior, folder: Path) -> None:
     """
     from peft import get_peft_model_state_dict
 
-    assert prior.text_encoder is not None
-    text = get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
-    library_class("StableDiffusionInpaintPipeline").save_lora_weights(
-        folder,
-        unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
-        text_encoder_lora_layers=_with_prefix(text),
-        weight_name=LORA_FILE,
-        unet_lora_adapter_metadata=_adapter_config(prior.unet),
-        text_encoder_lora_adapter_metadata=_adapter_config(prior.text_encoder),
-    )
+    arguments: dict[str, Any] = {}
+    for label, part in _adapted_parts(prior).items():
+        layers = get_peft_model_state_dict(part, save_embedding_layers=False)
+        name = label.replace("text", "text_encoder")
+        arguments[f"{name}_lora_layers"] = layers if label == "unet" else _with_prefix(layers)
+        arguments[f"{name}_lora_adapter_metadata"] = _adapter_config(part)
+    kind = "StableDiffusionXLInpaintPipeline" if prior.text_encoder_2 is not None else "StableDiffusionInpaintPipeline"
+    library_class(kind).save_lora_weights(folder, weight_name=LORA_FILE, **arguments)
     _sort_metadata(folder / LORA_FILE)
 
 
@@ -187,7 +190,7 @@ def _adapter_config(part: nn.Module) -> dict[str, Any]:
 def merge(prior: Prior, folder: Path) -> Prior:
     """Return the prior with the LoRA in `folder`. It shares the given prior's networks, which are changed in place.
 
-    The LoRA is merged into the weights of the UNet. The text encoder keeps separate LoRA layers.
+    The LoRA is merged into the weights of the UNet. The text encoders keep separate LoRA layers.
 
     Raises:
         ValueError: The folder contains no LoRA.
@@ -198,6 +201,6 @@ def merge(prior: Prior, folder: Path) -> Prior:
     pipe.load_lora_weights(folder, weight_name=LORA_FILE)
     prior.unet.fuse_lora()
     prior.unet.unload_lora()
-    for part in (prior.unet, prior.text_encoder):
+    for part in _adapted_parts(prior).values():
         part.requires_grad_(False).eval()
     return replace(prior)

@@ -14,13 +14,15 @@ import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
 
-from reffusion.weights.published import NETWORKS, PUBLISHED, TOKENIZERS
+from reffusion.weights.published import NETWORKS, PUBLISHED, REVISIONS, TOKENIZERS
 
 _OFFLINE_ADVICE = "run `make weights` on a machine with a network and copy its cache, or name a folder of weights"
 
 
 def download_model(name: str, half: bool, only: Sequence[str] = ()) -> Path:
     """Download a model into the hub's cache on this machine, and return its folder in the cache.
+
+    The revision is that of `REVISIONS`, else the one that an earlier download recorded (refs/main), else the newest.
 
     Args:
         name: hub id, owner/name.
@@ -39,21 +41,26 @@ def download_model(name: str, half: bool, only: Sequence[str] = ()) -> Path:
     remedy = f"take {known.instead}" if known else "take another model"
     if constants.HF_HUB_OFFLINE:
         raise ValueError(f"{name} is not here and HF_HUB_OFFLINE is set: unset it, or {_OFFLINE_ADVICE}")
+    entry_folder = Path(constants.HF_HUB_CACHE, repo_folder_name(repo_id=name, repo_type="model"))
+    main = entry_folder / "refs" / "main"  # the revision to load by default
+    revision = REVISIONS.get(name) or (main.read_text().strip() if main.is_file() else None)
     try:
-        info = HfApi().model_info(name, files_metadata=True)
+        info = HfApi().model_info(name, revision=revision, files_metadata=True)
         names = [entry.rfilename for entry in info.siblings]
         chosen = list(only) if only else select_files(names, half)
         absent = [each for each in only if each not in names]
         if absent or not chosen:
             missing = f"file {absent[0]}" if absent else ".safetensors weights, and others are not read"
             raise ValueError(f"{name} has no {missing}; {remedy}")
-        blobs = Path(constants.HF_HUB_CACHE, repo_folder_name(repo_id=name, repo_type="model"), "blobs")
         for entry in info.siblings:
             if entry.lfs and entry.rfilename in chosen:
                 url = hf_hub_url(name, entry.rfilename, revision=info.sha)
-                _download_file(url, blobs / entry.lfs.sha256, entry.lfs.sha256, entry.lfs.size, entry.rfilename)
+                _download_file(
+                    url, entry_folder / "blobs" / entry.lfs.sha256, entry.lfs.sha256, entry.lfs.size, entry.rfilename
+                )
         folder = Path(snapshot_download(name, revision=info.sha, allow_patterns=chosen))
-        _write_main_ref(folder)
+        main.parent.mkdir(exist_ok=True)
+        main.write_text(folder.name)  # the library does not write it when it downloads an exact revision
     except hub.GatedRepoError:
         raise ValueError(
             f"{name} is gated: accept its terms on its page of the hub and log in with `hf auth login`, or {remedy}"
@@ -62,6 +69,8 @@ def download_model(name: str, half: bool, only: Sequence[str] = ()) -> Path:
         raise ValueError(
             f"{name}: the hub has no such model: misspelt, moved, deleted or private; correct the name, or {remedy}"
         ) from None
+    except hub.RevisionNotFoundError:
+        raise ValueError(f"{name}: the hub has no revision {revision} any more; {remedy}") from None
     except ValueError:
         raise
     except Exception as error:  # the library passes on errors of its HTTP library
@@ -94,14 +103,6 @@ def select_files(names: Sequence[str], half: bool) -> list[str]:
         plain = [n for n in weights if ".fp16" not in n]
         chosen += marked if marked and (half or not plain) else plain
     return chosen if any(".safetensors" in name for name in chosen) else []
-
-
-def _write_main_ref(folder: Path) -> None:
-    """Write refs/main, the revision to load by default, for the snapshot `folder` of a model in the hub's cache."""
-    # The library does not write this file when it downloads an exact revision.
-    refs = folder.parent.parent / "refs"
-    refs.mkdir(exist_ok=True)
-    (refs / "main").write_text(folder.name)
 
 
 def _download_file(url: str, target: Path, sha256: str, size: int, name: str) -> None:

@@ -203,3 +203,12 @@ class Moebius:
 
 
 MOEBIUS = Moebius()
+
+# Revisions of models of the hub, as other projects' public manifests name them (November 2026; LaMa's file has the
+# sha256 1faef530...). Of a model that is missing here the revision of the first download is recorded.
+REVISIONS = {
+    SD2: "5f74973cbb64c8568780732c17f43eb269d63a0d",
+    SDXL: "115134f363124c53c7d878647567d04daf26e41e",
+    DEPTH_ANYTHING: "5426e4f0f36572d16453bbda7a8389317b1bef99",
+    PAINTERS["lama"].repo: "a3ee2fca54baebec351b8fa7786154ffa7555aa6",
+}

@@ -30,4 +30,5 @@ def unavailable(params: Params) -> list[str]:
 
     The stage runs again once they can be computed.
     """
-    return ["LPIPS"] if local.lpips_need().problem else []
+    needs = {"LPIPS": local.lpips_need(), "the score of leftovers": local.segmenter_need()}
+    return [name for name, need in needs.items() if need.problem]

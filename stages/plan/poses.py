@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from reffusion.capture import lens
@@ -10,7 +11,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.roles import capture_views, describe_split
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
 from reffusion.io.annotations import file_of
-from reffusion.io.images import ENDINGS
+from reffusion.io.images import ENDINGS, image_size
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 from reffusion.references.files import PAINTED, describe_references, load_reference_files
@@ -18,6 +19,7 @@ from reffusion.references.files import PAINTED, describe_references, load_refere
 # Endings of pictures and depth maps. Of such files the stage reads only those of the capture; others are masks or
 # references, which later stages read.
 NOT_READ = (*ENDINGS, ".npy", ".exr")
+REDUCED = re.compile(r"images_\d+")  # folders of pictures at a fraction of their size
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -90,6 +92,7 @@ def preview(params: Params, scene: Path) -> list[str]:
     notes = [describe_split(len(roles.train), len(roles.test))]
     notes += [f"{len(roles.camera_only)} views are camera-only"] if roles.camera_only else []
     notes += _describe_poses(capture, scene)
+    notes += _describe_reduced_pictures(capture, params.longest)
     notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []
     return [*notes, *capture.warnings, *check_gaussian_files(params, scene)]
 
@@ -107,4 +110,16 @@ def _describe_poses(capture: Capture, scene: Path) -> list[str]:
     return [
         f"the poses come from {capture.pose_source.relative_to(scene)}",
         "the photographs need no undistortion: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
+    ]
+
+
+def _describe_reduced_pictures(capture: Capture, longest: int) -> list[str]:
+    """Say at which size the scene runs if its pictures are a reduced copy (`images_4`) with fewer than `longest` px."""
+    picture = next(iter(capture.pictures.values()))
+    size, folder = image_size(picture), picture.parent.name
+    if max(size) >= longest or not REDUCED.fullmatch(folder):
+        return []
+    return [
+        f"the scene runs at {size[0]}x{size[1]} px, the size of {folder}, not at the {longest} px of poses.longest: "
+        "it brings no larger pictures"
     ]
