@@ -145,3 +145,19 @@ def delete_folder(folder: Path) -> None:
         shutil.rmtree(gone, ignore_errors=True)
         folder.rename(gone)
         shutil.rmtree(gone)
+
+
+def take_over(folder: Path) -> None:
+    """Restore `folder` from the newest attempt whose runner or machine was lost, if `folder` does not exist.
+
+    The attempt's folder, <folder>.<suffix>, is copied and not renamed, because the lost attempt may still write to it.
+    The folders of all attempts are removed, even if `folder` exists.
+    """
+    attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
+    for attempt in reversed(attempts):
+        if not folder.exists():
+            copy = folder.with_name(f".copying-{folder.name}")
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(attempt, copy, ignore=shutil.ignore_patterns("*.writing"))
+            copy.rename(folder)
+        shutil.rmtree(attempt, ignore_errors=True)

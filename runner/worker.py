@@ -1,7 +1,7 @@
 """The process that imports stages, started as `python -m runner.worker <command>`.
 
-The command is `describe` (answers questions about stages), `fetch` (downloads the weights that stages need), `frames`
-(extracts the frames of a video) or `run` (runs a stage). Input is read from the standard input.
+The command is `describe` (answers questions about stages), `frames` (extracts the frames of a video) or `run` (runs a
+stage). Input is read from the standard input.
 
 The description of a stage is a module with the class Params and optional functions (needed_weights, unavailable,
 optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
@@ -38,13 +38,13 @@ CUDA_FILE = Path("stages/plan/cuda.py")  # relative to the root
 THREADS = ("OMP", "MKL", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
 
 
-def _description_file(stage: str) -> Path:
+def description_file(stage: str) -> Path:
     """Return the file that describes a stage, relative to the root, which is the working directory."""
     path = Path(f"stages/plan/{stage}.py")
     return path if path.is_file() else Path(f"stages/{stage}.py")
 
 
-def _import_file(path: Path) -> Any:
+def import_file(path: Path) -> Any:
     """Import a Python file, whose path is relative to the root, as a module."""
     return importlib.import_module(".".join(path.with_suffix("").parts))
 
@@ -71,9 +71,9 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
     needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
-    path = _description_file(stage)
+    path = description_file(stage)
     try:
-        planned = _import_file(path)
+        planned = import_file(path)
         path = Path(f"stages/{stage}.py")
         _check_run(path, question["takes"])
     except Exception as error:
@@ -99,7 +99,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and answer["params"].get("device") == "cuda" and CUDA_FILE.is_file():
-        answer["lacks"] = _import_file(CUDA_FILE).find_missing(stage, resolved)
+        answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, resolved)
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)
@@ -163,38 +163,6 @@ def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
     # Of a parameter with alternative types, such as `str | list[str]`, the location also names the type that was tried.
     tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
     return [str(part) for part in (loc[:1] + loc[2:] if tried else loc)]
-
-
-def fetch() -> int:
-    """Download the missing weights that stages need or could use, each once.
-
-    Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
-
-    Returns:
-        Number of failed downloads of weights that stages need. Errors are printed to the standard error; for weights
-        that stages only could use they are warnings.
-    """
-    downloads, optional = {}, set()
-    for stage, question in json.load(sys.stdin).items():
-        planned = _import_file(_description_file(stage))
-        params, needs = planned.Params(**question["params"]), []
-        if hasattr(planned, "needed_weights"):
-            needs += planned.needed_weights(params, frozenset(question["brings"]))
-        if hasattr(planned, "optional_weights"):
-            more = planned.optional_weights(params)
-            optional |= {need.name for need in more} - {need.name for need in needs}
-            needs += more
-        downloads |= {need.name: need for need in needs if need.problem and need.fetched}
-    failed = 0
-    for need in downloads.values():
-        try:
-            need.fetch()
-            print(f"{need.name}: fetched", flush=True)
-        except ValueError as error:
-            failed += need.name not in optional
-            words = ("warning", "; the job runs without it") if need.name in optional else ("error", "")
-            print(f"{words[0]}: {format_error(error)}{words[1]}", file=sys.stderr, flush=True)
-    return failed
 
 
 def frames() -> int:
@@ -269,7 +237,7 @@ def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
     """Run a stage in this process and return its answer, see `run`; the traceback of an error is written to `log`."""
     started = time.perf_counter()
     try:
-        params = _import_file(_description_file(job["stage"])).Params(**job["params"])
+        params = import_file(description_file(job["stage"])).Params(**job["params"])
         stage = importlib.import_module(f"stages.{job['stage']}")
         needs = {name: path and Path(path) for name, path in job["needs"].items()}
         stage.run(params, Path(job["out"]), **needs)
@@ -297,7 +265,7 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    code = {"describe": describe, "fetch": fetch, "frames": frames, "run": run}[sys.argv[1]]()
+    code = {"describe": describe, "frames": frames, "run": run}[sys.argv[1]]()
     if sys.argv[1] == "run":
         # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()

@@ -26,7 +26,7 @@ from report import before_after, charts, compare_pictures, job, job_data, result
 from report import compare as page
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
-from runner.compare import compare
+from runner.fleet.compare import compare
 
 pytestmark = pytest.mark.integration
 

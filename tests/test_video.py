@@ -19,8 +19,8 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
 from report import cli
 from runner import Refused
+from runner.fleet.maintenance import clean
 from runner.frames import update_frames
-from runner.maintenance import clean
 from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
