@@ -18,10 +18,10 @@ from runner.fleet.garbage import collect_garbage
 from runner.fleet.maintenance import clean, verify
 from runner.fleet.weights import fetch_weights
 from runner.plan import plan
-from runner.plan_table import plan_record, plan_table
+from runner.plan_table import plan_table
 from runner.process import ThisMachine
 from runner.resolve import Request, resolve
-from runner.results import call_report, show_results
+from runner.results import call_report, plan_record, show_results
 from runner.text import display_path, format_error
 from runner.worker import INTERRUPTED
 

@@ -45,16 +45,11 @@ def diff_artifact(folder: Path, hashes: Hashes) -> ArtifactDiff:
 
     If the receipt is missing or cannot be read, all files count as added.
     """
-    receipt, now = read_receipt(folder), hash_contents(folder, hashes)["files"]
-    if not receipt:
-        return ArtifactDiff(added=tuple(now))
+    receipt, now = read_receipt(folder) or {"files": {}}, hash_contents(folder, hashes)["files"]
     then = receipt["files"]
-    return ArtifactDiff(
-        tuple(name for name in then if name not in now),
-        tuple(name for name in then if now.get(name, then[name]) != then[name]),
-        tuple(name for name in now if name not in then),
-        tuple(receipt.get("by_hand", ())),
-    )
+    changed = tuple(name for name in then if now.get(name, then[name]) != then[name])
+    missing, added = (tuple(name for name in one if name not in other) for one, other in ((then, now), (now, then)))
+    return ArtifactDiff(missing, changed, added, tuple(receipt.get("by_hand", ())))
 
 
 def hash_contents(folder: Path, hashes: Hashes) -> dict[str, Any]:

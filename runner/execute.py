@@ -18,28 +18,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from runner import Failed, Refused, say
-from runner.artifacts import (
-    accept_changes,
-    delete_folder,
-    diff_artifact,
-    hash_contents,
-    recover_swap,
-    replace_artifact,
-    take_over,
-)
+from runner import Failed, Refused, artifacts, files, say
 from runner.durations import expected_seconds, total_time, typical_seconds
-from runner.files import (
-    MACHINE,
-    RECEIPT,
-    check_lock,
-    export_folders,
-    hold_lock,
-    read_json,
-    read_receipt,
-    write_json,
-    write_text,
-)
+from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import Decision, decide, partial_folder, plan, used_needs
@@ -84,7 +65,7 @@ def _run_stage(
     assert decision.inputs
     # If an interrupted run with the same key left this folder, the stage resumes from its state.
     partial = partial_folder(job, stage, decision.inputs.key)
-    take_over(partial)
+    artifacts.take_over(partial)
     if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
     if not read_receipt(partial):  # a receipt is there if it was copied, or the runner was killed before the renames
@@ -94,13 +75,13 @@ def _run_stage(
         result = _run_in_engine(execution, job, stage, partial, decisions, lock)
         interrupted = result.interrupted
         say(f"{stage}: done in {result.answer['seconds']:.1f} s, {result.answer['peak_memory_mb']} MB")
-        check_lock(lock)
+        files.check_lock(lock)
         answer = {"resumed": resumed} | result.answer  # its seconds are of the last try only
         write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, answer))
-    export_folders(partial, place, job.home, job.pipeline.stages[stage].export)
-    replace_artifact(partial, place, job.hashes)
+    files.export_folders(partial, place, job.home, job.pipeline.stages[stage].export)
+    artifacts.replace_artifact(partial, place, job.hashes)
     for abandoned in job.home.glob(f".partial-{stage}-*"):
-        delete_folder(abandoned)
+        artifacts.delete_folder(abandoned)
     job.hashes.save()
     if interrupted:
         raise KeyboardInterrupt
@@ -119,10 +100,10 @@ def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str 
     """Copy an undamaged artifact with this key from another variant of the scene; return its folder's name, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
-            with suppress(Refused), hold_lock(job.runs, home.name, shared=True, wait=False):
+            with suppress(Refused), files.hold_lock(job.runs, home.name, shared=True, wait=False):
                 copy, found = job.home / f".copying-{stage}", read_receipt(home / stage)
-                delete_folder(copy)
-                if found and found["key"] == key and not diff_artifact(home / stage, job.hashes).describe():
+                artifacts.delete_folder(copy)
+                if found and found["key"] == key and not artifacts.diff_artifact(home / stage, job.hashes).describe():
                     shutil.copytree(home / stage, copy)
                     copy.rename(to)
                     return home.name
@@ -164,7 +145,7 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         "key": inputs.key,
         **asdict(inputs),
         "profile": job.profile,
-        **hash_contents(folder, job.hashes),
+        **artifacts.hash_contents(folder, job.hashes),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
         "machine": MACHINE,
@@ -209,10 +190,10 @@ def run_scene(
     stages = job.pipeline.closure(target)
     with ExitStack() as locks:
         if job.home != job.base:
-            locks.enter_context(hold_lock(job.runs, job.base.name, shared=True))
-        lock = locks.enter_context(hold_lock(job.runs, job.home.name))
+            locks.enter_context(files.hold_lock(job.runs, job.base.name, shared=True))
+        lock = locks.enter_context(files.hold_lock(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
-        recover_swap(job.home, job.hashes)
+        artifacts.recover_swap(job.home, job.hashes)
         planned = plan(job, stages)
         say(plan_table(job, planned))
         _refuse_missing(job, planned)
@@ -224,7 +205,7 @@ def run_scene(
             done[stage] = decide(job, stage, done)
             if done[stage].status == "cached":
                 if job.keep and done[stage].path == job.home / stage:
-                    accept_changes(job.home / stage, job.hashes)
+                    artifacts.accept_changes(job.home / stage, job.hashes)
                 for warning in read_json(done[stage].path / "warnings.json") or ():  # a stage that runs prints its own
                     say(f"warning: {warning}")
             elif done[stage].status == "run":

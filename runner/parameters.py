@@ -56,9 +56,9 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
             value = parse_value(value_text, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
         except ValueError:
             raise Refused(f"set: the value of {stage}{names} is not valid YAML: {value_text!r:.60}") from None
-        for name in reversed(names[1:].split(".")):
+        for name in reversed(f"{stage}{names}".split(".")):
             value = {name: value}
-        overrides[stage] = merge_params(overrides.get(stage, {}), value)
+        overrides = merge_params(overrides, value)
     return overrides
 
 
@@ -147,9 +147,9 @@ def parse_duration(text: object, origin: str) -> float:
         Refused: the text has another form, or the duration is 0.
     """
     number = r"(\d+(?:\.\d+)?)"
-    found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", str(text).strip().lower())
-    parts = zip(found.groups(), (3600, 60, 1, 1), strict=True) if found else ()
-    seconds = sum(float(number or 0) * unit for number, unit in parts)
+    found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s?)?", str(text).strip().lower())
+    hours, minutes, seconds = (float(part or 0) for part in found.groups()) if found else (0, 0, 0)
+    seconds += 60 * (minutes + 60 * hours)
     if seconds <= 0:
         raise Refused(f"{origin}: budget {text!r} is no time; write it like 5m, 90s or 1h30m")
     return seconds
@@ -174,10 +174,9 @@ def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overr
     """
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
-    set_params = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}
-    has_values = lambda expected: all(set_params.get(param, ...) == value for param, value in expected.items())
-    is_true = lambda c: c.param and has_values(dict.fromkeys(c.param, c.equals) | c.only)
-    remaining = [name for name in pipeline.budget if not any(is_true(c) for c in pipeline.stages[name].skip_if)]
+    asked = flatten_params(values).items()
+    is_true = lambda condition: condition.param and condition.expected.items() <= asked
+    remaining = [name for name in pipeline.budget if not any(map(is_true, pipeline.stages[name].skip_if))]
     if not remaining:
         return {}
     scale = sum(pipeline.budget.values()) / sum(pipeline.budget[name] for name in remaining)

@@ -23,6 +23,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import NoneType, UnionType
@@ -70,7 +71,6 @@ def describe() -> None:
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
-    needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
     path = description_file(stage)
     try:
         planned = import_file(path)
@@ -80,41 +80,51 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         return {"broken": f"{path}: {format_error(error)}"}  # the stage's code has an error
     fields = dict(_fields(planned.Params))
     try:
-        resolved = planned.Params(**question["params"])
+        params = planned.Params(**question["params"])
     except ValidationError as error:
         return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
-    marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
-    answer: dict[str, Any] = {
-        "params": resolved.model_dump(mode="json"),
-        "weights": [name for name, extra in marks.items() if extra.get("weights")],
-        "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
-        "programs": [name for name, extra in marks.items() if extra.get("program")],
-    }
+    marked = lambda mark, value: [name for name, marks in fields.items() if (marks or {}).get(mark) is value]
+    answer = {"params": params.model_dump(mode="json"), "weights": marked("weights", True)}
+    answer |= {"unkeyed": marked("keyed", False), "programs": marked("program", True)}
     if hasattr(planned, "machine_facts"):
-        answer["machine"] = planned.machine_facts(resolved)
-    if brings is not None and hasattr(planned, "optional_weights"):
-        answer["optional"] = [asdict(need) for need in planned.optional_weights(resolved)]
+        answer["machine"] = planned.machine_facts(params)
     if hasattr(planned, "unavailable"):
-        answer["unavailable"] = planned.unavailable(resolved)
-    if brings is not None and hasattr(planned, "needed_weights"):
-        answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
-    if brings is not None and answer["params"].get("device") == "cuda" and CUDA_FILE.is_file():
-        answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, resolved)
-    if scene is not None and hasattr(planned, "scene_files"):
-        files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
-        answer["reads"] = sorted(str(path) for path in files)
-    if scene is not None and hasattr(planned, "scene_facts"):
+        answer["unavailable"] = planned.unavailable(params)
+    if "brings" in question:
+        answer |= _describe_lacks(planned, params, stage, frozenset(question["brings"]))
+    if "scene" in question:
+        answer |= _describe_scene(planned, params, Path(question["scene"]))
+    if "needs" in question and hasattr(planned, "preview"):
+        needs = {name: path and Path(path) for name, path in question["needs"].items()}
         try:
-            answer["facts"] = planned.scene_facts(resolved, Path(scene))
-        except ValueError:  # the stage's preview reports this error
-            answer["facts"] = {}
-    if needs is not None and hasattr(planned, "preview"):
-        try:
-            answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
+            answer["notes"] = list(planned.preview(params, **needs))
         except ValueError as error:
             answer["refusal"] = format_error(error)
         except Exception as error:
             answer["notes"] = [f"(its preview failed: {format_error(error)})"]
+    return answer
+
+
+def _describe_lacks(planned: Any, params: Any, stage: str, brings: frozenset[str]) -> dict[str, Any]:
+    """Return the weights that a stage needs and could use, and what this machine lacks for CUDA."""
+    answer = {}
+    if hasattr(planned, "needed_weights"):
+        answer["needed"] = [asdict(need) for need in planned.needed_weights(params, brings)]
+    if hasattr(planned, "optional_weights"):
+        answer["optional"] = [asdict(need) for need in planned.optional_weights(params)]
+    if getattr(params, "device", "cpu") == "cuda" and CUDA_FILE.is_file():
+        answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, params)
+    return answer
+
+
+def _describe_scene(planned: Any, params: Any, scene: Path) -> dict[str, Any]:
+    """Return which files of the scene a stage reads, and which facts about it the stage depends on."""
+    answer: dict[str, Any] = {}
+    if hasattr(planned, "scene_files"):
+        answer["reads"] = sorted(map(str, planned.scene_files(params, scene, list(list_files(scene)))))
+    if hasattr(planned, "scene_facts"):
+        with suppress(ValueError):  # the stage's preview reports this error
+            answer["facts"] = planned.scene_facts(params, scene)
     return answer
 
 
