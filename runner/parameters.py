@@ -147,9 +147,9 @@ def parse_duration(text: object, origin: str) -> float:
         Refused: the text has another form, or the duration is 0.
     """
     number = r"(\d+(?:\.\d+)?)"
-    found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s?)?", str(text).strip().lower())
-    hours, minutes, seconds = (float(part or 0) for part in found.groups()) if found else (0, 0, 0)
-    seconds += 60 * (minutes + 60 * hours)
+    found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", str(text).strip().lower())
+    parts = zip(found.groups(), (3600, 60, 1, 1), strict=True) if found else ()
+    seconds = sum(float(number or 0) * unit for number, unit in parts)
     if seconds <= 0:
         raise Refused(f"{origin}: budget {text!r} is no time; write it like 5m, 90s or 1h30m")
     return seconds
