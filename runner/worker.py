@@ -181,7 +181,7 @@ def frames() -> int:
     Reads a JSON object: {"video": path, "folder": path of the folder to fill, "content": hash of the video}.
     """
     question = json.load(sys.stdin)
-    video = importlib.import_module("reffusion.capture.layouts.video")
+    video = importlib.import_module("reffusion.capture.video_frames")
     try:
         print(video.extract_frames(Path(question["video"]), Path(question["folder"]), question["content"]))
     except ValueError as error:
