@@ -62,7 +62,7 @@ def _print_problems(missing: list[dict[str, Any]]) -> None:
             print(f"looked for {', '.join(names)} in {', '.join(places)}")
 
 
-def _fetch() -> int:
+def fetch() -> int:
     """Download the missing weights that stages need or could use, each once.
 
     Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
@@ -95,4 +95,4 @@ def _fetch() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(_fetch())
+    sys.exit(fetch())
