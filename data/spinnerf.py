@@ -8,14 +8,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from reffusion.capture.layouts import spinnerf
+from reffusion.capture import spinnerf_scenes
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
     try:
-        print("\n".join(spinnerf.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
+        print("\n".join(spinnerf_scenes.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -21,21 +21,20 @@ Modules:
   - keys.py: hashes of everything that an artifact depends on: contents of folders, code, parameters.
   - plan_table.py: a plan as text. durations.py: expected times.
 - execute.py: runs stages, each in a new process, writes receipts, and renames folders into place.
-  - engine.py: runs the process on this machine; on a cluster: ray_engine.py, slurm_engine.py, retry.py.
   - artifacts.py: compares artifacts with their receipts, and replaces them so that a killed runner loses nothing.
   - files.py: atomic writes, locks, exported copies.
-- worker.py: the process that imports stages. process.py: starts this process and sends it questions.
-- compare.py: the commands `compare` and `batch`, which run many jobs.
-  - parallel.py: several runs at once. progress.py: the progress of each.
+- worker.py: the process that imports stages. process.py: starts this process, sends it questions, runs stages in it.
 - results.py: prints scores, and calls report/ for tables and pages.
-- maintenance.py: verifies or removes artifacts. garbage.py: removes artifacts that no plan uses.
-- weights.py: lists and fetches the weights that stages need.
 - text.py: errors, sizes, times and paths as text.
+- fleet/: commands on many scenes, variants or machines, and those beside a run. Only __main__.py imports it.
+  - compare.py: the commands `compare` and `batch`. parallel.py: several runs at once. progress.py: shows each.
+  - engine.py: shares this machine among stages; on a cluster: ray_engine.py, slurm_engine.py, retry.py.
+  - maintenance.py: verifies or removes artifacts. garbage.py: removes artifacts that no plan uses.
+  - weights.py: lists and fetches the weights that stages need.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TextIO
 
 
 class Refused(Exception):
@@ -46,20 +45,9 @@ class Failed(Exception):
     """The failure of a stage, with a message of one line."""
 
 
+OUTPUT: ContextVar[TextIO | None] = ContextVar("output", default=None)  # where `say` prints; None: standard output
+
+
 def say(text: str) -> None:
-    """Print a message, or pass it to the function set by `redirect_output`."""
-    redirect = _redirect.get()
-    print(text, flush=True) if redirect is None else redirect(text)
-
-
-@contextmanager
-def redirect_output(redirect: Callable[[str], None]) -> Iterator[None]:
-    """Inside the context, call `redirect` with each message of `say` in this thread instead of printing the message."""
-    token = _redirect.set(redirect)
-    try:
-        yield
-    finally:
-        _redirect.reset(token)
-
-
-_redirect: ContextVar[Callable[[str], None] | None] = ContextVar("redirect", default=None)
+    """Print a message to OUTPUT, which each thread may set for itself."""
+    print(text, file=OUTPUT.get(), flush=True)

@@ -10,18 +10,19 @@ from pathlib import Path
 
 from reffusion.command import workplace
 from runner import Failed, Refused
-from runner.compare import batch, compare
-from runner.engine import ENGINES, make_engine
 from runner.execute import Execution, run_scene
 from runner.files import write_json
-from runner.garbage import collect_garbage
-from runner.maintenance import clean, verify
+from runner.fleet.compare import batch, compare
+from runner.fleet.engine import ENGINES, expected_memory_mb, make_engine
+from runner.fleet.garbage import collect_garbage
+from runner.fleet.maintenance import clean, verify
+from runner.fleet.weights import fetch_weights
 from runner.plan import plan
-from runner.plan_table import plan_record, plan_table
+from runner.plan_table import plan_table
+from runner.process import ThisMachine
 from runner.resolve import Request, resolve
-from runner.results import call_report, show_results
+from runner.results import call_report, plan_record, show_results
 from runner.text import display_path, format_error
-from runner.weights import fetch_weights
 from runner.worker import INTERRUPTED
 
 SOME_FAILED = 3  # exit code of `compare` if it finished and some runs failed
@@ -60,8 +61,8 @@ def _plan(request: Request, arguments: argparse.Namespace) -> int:
 
 
 def _run(request: Request, arguments: argparse.Namespace) -> int:
-    execution = _execution(request, arguments)
-    request = replace(request, cuda=execution.engine.cuda)
+    alone = not (arguments.engine or arguments.address)
+    request, execution = _choose_engine(request, arguments, ThisMachine() if alone else None)
     stage, folder = list(run_scene(request, arguments.stage, None, execution).items())[-1]
     show_results(stage, folder, request)
     return 0
@@ -69,8 +70,8 @@ def _run(request: Request, arguments: argparse.Namespace) -> int:
 
 def _compare(request: Request, arguments: argparse.Namespace) -> int:
     """Run a comparison, draw its page (even if some runs failed), and return the exit code."""
-    execution, data = _execution(request, arguments), arguments.data
-    request = replace(request, cuda=execution.engine.cuda)
+    request, execution = _choose_engine(request, arguments)
+    data = arguments.data
     failed = compare(request, arguments.variants, arguments.seeds, data, execution)
     what = f"--data={data}" if data else f"--scene={request.scene}"
     return call_report("compare", what, f"--runs={display_path(request.runs)}") or (SOME_FAILED if failed else 0)
@@ -78,8 +79,7 @@ def _compare(request: Request, arguments: argparse.Namespace) -> int:
 
 def _batch(request: Request, arguments: argparse.Namespace) -> int:
     """Run a batch, draw its page (even if some scenes failed), and return the exit code."""
-    execution = _execution(request, arguments)
-    request = replace(request, cuda=execution.engine.cuda)
+    request, execution = _choose_engine(request, arguments)
     failed = batch(request, arguments.data or Path("data"), execution)
     options = f"--runs={display_path(request.runs)}", f"--variant={request.variant or ''}"
     return call_report("batch", *options) or int(failed > 0)
@@ -107,11 +107,17 @@ _COMMANDS = {
 }
 
 
-def _execution(request: Request, arguments: argparse.Namespace) -> Execution:
+def _choose_engine(
+    request: Request, arguments: argparse.Namespace, this_machine: ThisMachine | None = None
+) -> tuple[Request, Execution]:
+    """Return the request and the execution on `this_machine`, or else on the engine that the arguments name."""
     if arguments.cores is not None and arguments.cores < 1:
         raise Refused(f"cores={arguments.cores}: cores must be at least 1; it is the number of cores of each stage")
+    if this_machine:
+        return request, Execution(this_machine, arguments.cores)
     engine = make_engine(arguments.engine, arguments.address, request.root, request.runs)
-    return Execution(engine, arguments.cores)
+    execution = Execution(engine, arguments.cores, memory_mb=expected_memory_mb)
+    return replace(request, cuda=engine.cuda), execution
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -45,16 +45,11 @@ def diff_artifact(folder: Path, hashes: Hashes) -> ArtifactDiff:
 
     If the receipt is missing or cannot be read, all files count as added.
     """
-    receipt, now = read_receipt(folder), hash_contents(folder, hashes)["files"]
-    if not receipt:
-        return ArtifactDiff(added=tuple(now))
+    receipt, now = read_receipt(folder) or {"files": {}}, hash_contents(folder, hashes)["files"]
     then = receipt["files"]
-    return ArtifactDiff(
-        tuple(name for name in then if name not in now),
-        tuple(name for name in then if now.get(name, then[name]) != then[name]),
-        tuple(name for name in now if name not in then),
-        tuple(receipt.get("by_hand", ())),
-    )
+    changed = tuple(name for name in then if now.get(name, then[name]) != then[name])
+    missing, added = (tuple(name for name in one if name not in other) for one, other in ((then, now), (now, then)))
+    return ArtifactDiff(missing, changed, added, tuple(receipt.get("by_hand", ())))
 
 
 def hash_contents(folder: Path, hashes: Hashes) -> dict[str, Any]:
@@ -145,3 +140,19 @@ def delete_folder(folder: Path) -> None:
         shutil.rmtree(gone, ignore_errors=True)
         folder.rename(gone)
         shutil.rmtree(gone)
+
+
+def take_over(folder: Path) -> None:
+    """Restore `folder` from the newest attempt whose runner or machine was lost, if `folder` does not exist.
+
+    The attempt's folder, <folder>.<suffix>, is copied and not renamed, because the lost attempt may still write to it.
+    The folders of all attempts are removed, even if `folder` exists.
+    """
+    attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
+    for attempt in reversed(attempts):
+        if not folder.exists():
+            copy = folder.with_name(f".copying-{folder.name}")
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(attempt, copy, ignore=shutil.ignore_patterns("*.writing"))
+            copy.rename(folder)
+        shutil.rmtree(attempt, ignore_errors=True)

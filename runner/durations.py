@@ -4,8 +4,6 @@ The table of pipeline.yaml has rates that were measured on two cores and on one 
 scenes on this machine tell how much slower or faster this machine is.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re
@@ -42,9 +40,9 @@ def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     typical = typical_seconds(job, stage)
     if job.gpu:
         return typical
-    here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
-    if here:
-        return max(here, key=lambda r: r["date"])["seconds"]
+    alike = {"machine": MACHINE, "profile": job.profile}.items()
+    if here := [receipt for receipt in earlier_receipts(job, stage) if alike <= receipt.items()]:
+        return max(here, key=lambda receipt: receipt["date"])["seconds"]
     return None if typical is None else typical * _slowness(job)
 
 
@@ -59,7 +57,8 @@ def typical_seconds(job: ResolvedJob, stage: str) -> float | None:
     device = job.params[stage].get("device", "cpu")
     if rates is None or capture is None or rates.device != device:
         return None
-    factor = job.pipeline.gpus.get(_gpu(job)) if device == "cuda" else _time_share(_cores()) / _time_share(CORES)
+    cores = len(os.sched_getaffinity(0))
+    factor = job.pipeline.gpus.get(_gpu(job)) if device == "cuda" else _time_share(cores) / _time_share(CORES)
     if factor is None:
         return None
     train, test, *_ = map(len, capture["views"])
@@ -67,10 +66,6 @@ def typical_seconds(job: ResolvedJob, stage: str) -> float | None:
     size = capture["megapixels"] / rates.megapixels if rates.megapixels else 1.0
     seconds = rates.base + rates.test * test + size * (rates.view * train + rates.step * steps)
     return factor * (seconds + (0 if capture["brings_poses"] else rates.placed * train))
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 def _time_share(cores: int) -> float:
@@ -98,10 +93,8 @@ def _gpu_names() -> str:
 def _slowness(job: ResolvedJob) -> float:
     """Return how many times longer stages take on this machine than the table says; 1 before the first stage."""
     paths = sorted(job.runs.glob("*/*/receipt.json"))[-MAX_RECEIPTS:]
-    receipts = [receipt for path in paths if (receipt := read_receipt(path.parent))]
-    known = [
-        r for r in receipts if r.get("typical_seconds") and r.get("machine") == MACHINE and not r.get("resumed", False)
-    ]
+    receipts = [found for path in paths if (found := read_receipt(path.parent)) and found.get("machine") == MACHINE]
+    known = [receipt for receipt in receipts if receipt.get("typical_seconds") and not receipt.get("resumed")]
     seconds, typical = (sum(r[name] for r in known) + PRIOR_SECONDS for name in ("seconds", "typical_seconds"))
     return seconds / typical
 
@@ -119,15 +112,7 @@ def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
 
     Stages without a known time are named.
     """
-    total, unknown = 0.0, []
-    for stage, decision in decisions.items():
-        if not is_timed(job, decision):
-            continue
-        seconds = expected_seconds(job, stage)
-        if seconds is None:
-            unknown.append(stage)
-        else:
-            total += seconds
-    if not total:
-        return ""
-    return format_seconds(total) + (f" and the time of {', '.join(unknown)}" if unknown else "")
+    seconds = {stage: expected_seconds(job, stage) for stage, each in decisions.items() if is_timed(job, each)}
+    unknown = ", ".join(stage for stage, known in seconds.items() if known is None)
+    total = sum(filter(None, seconds.values()))
+    return (format_seconds(total) + (f" and the time of {unknown}" if unknown else "")) if total else ""

@@ -14,38 +14,19 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from runner import Failed, Refused, say
-from runner.artifacts import accept_changes, delete_folder, diff_artifact, hash_contents, recover_swap, replace_artifact
-from runner.durations import earlier_receipts, expected_seconds, total_time, typical_seconds
-from runner.engine import Engine, LocalEngine, Resources, Task
-from runner.files import (
-    MACHINE,
-    RECEIPT,
-    check_lock,
-    export_folders,
-    hold_lock,
-    list_files,
-    read_json,
-    read_receipt,
-    write_json,
-    write_text,
-)
+from runner import Failed, Refused, artifacts, files, say
+from runner.durations import expected_seconds, total_time, typical_seconds
+from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
-from runner.plan import (
-    Decision,
-    decide,
-    partial_folder,
-    plan,
-    used_needs,
-)
+from runner.plan import Decision, decide, partial_folder, plan, used_needs
 from runner.plan_table import plan_table
+from runner.process import Engine, Resources, StageResult, Task, ThisMachine
 from runner.resolve import Request, ResolvedJob, resolve
-from runner.retry import take_over
 from runner.text import REMEDIES, display_path, format_seconds
 
 # packages whose versions a receipt records
@@ -65,64 +46,64 @@ class Execution:
         output: the file to which stages append what they print; None for the runner's own output.
         on_change: called with the name of a stage and its new state: "waits" (for cores, GPUs or memory), "runs" or
             "done". A stage that need not run is done at once.
+        memory_mb: called with the job, a stage and the folders of its needs; returns the memory to reserve, MB.
     """
 
-    engine: Engine
+    engine: Engine = field(default_factory=ThisMachine)
     cores: int | None = None
     gpu_cores: int | None = None
     output: Path | None = None
     on_change: Callable[[str, str], None] = lambda stage, state: None
+    memory_mb: Callable[[ResolvedJob, str, dict[str, Path | None]], int] = lambda job, stage, needs: 0
 
 
 def _run_stage(
-    job: ResolvedJob,
-    stage: str,
-    decision: Decision,
-    time_left: str,
-    earlier: dict[str, Decision],
-    lock: int,
-    execution: Execution,
+    job: ResolvedJob, stage: str, time_left: str, decisions: dict[str, Decision], lock: int, execution: Execution
 ) -> Decision:
     """Run one stage or copy its artifact, move the artifact into place, return `cached`; raises Failed if it fails."""
+    decision, place, interrupted = decisions[stage], job.home / stage, False
     assert decision.inputs
     # If an interrupted run with the same key left this folder, the stage resumes from its state.
-    partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
-    take_over(partial)
+    partial = partial_folder(job, stage, decision.inputs.key)
+    artifacts.take_over(partial)
     if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
     if not read_receipt(partial):  # a receipt is there if it was copied, or the runner was killed before the renames
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
         say(f"{stage}: {decision.reason}{time_left}")
-        result = _run_in_engine(execution, job, stage, partial, earlier, lock)  # its seconds are of the last try only
-        say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
-        check_lock(lock)
-        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, {"resumed": resumed} | result))
-    for message in export_folders(partial, place, job.home, job.pipeline.stages[stage].export):
-        say(message)
-    replace_artifact(partial, place, job.hashes)
+        result = _run_in_engine(execution, job, stage, partial, decisions, lock)
+        interrupted = result.interrupted
+        say(f"{stage}: done in {result.answer['seconds']:.1f} s, {result.answer['peak_memory_mb']} MB")
+        files.check_lock(lock)
+        answer = {"resumed": resumed} | result.answer  # its seconds are of the last try only
+        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, answer))
+    files.export_folders(partial, place, job.home, job.pipeline.stages[stage].export)
+    artifacts.replace_artifact(partial, place, job.hashes)
     for abandoned in job.home.glob(f".partial-{stage}-*"):
-        delete_folder(abandoned)
+        artifacts.delete_folder(abandoned)
     job.hashes.save()
+    if interrupted:
+        raise KeyboardInterrupt
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 
 
 def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     """Return text on the expected time of the first of these stages and of all of them; "" if it is unknown."""
-    seconds, total = expected_seconds(job, next(iter(decisions))), total_time(job, decisions)
+    seconds = expected_seconds(job, next(iter(decisions)))
     if seconds is None:
         return ""
-    return f"; about {format_seconds(seconds)}" + (f", {total} to the end" if len(decisions) > 1 else "")
+    return f"; about {format_seconds(seconds)}" + (f", {total_time(job, decisions)} to the end" * (len(decisions) > 1))
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
     """Copy an undamaged artifact with this key from another variant of the scene; return its folder's name, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
-            with suppress(Refused), hold_lock(job.runs, home.name, shared=True, wait=False):
+            with suppress(Refused), files.hold_lock(job.runs, home.name, shared=True, wait=False):
                 copy, found = job.home / f".copying-{stage}", read_receipt(home / stage)
-                delete_folder(copy)
-                if found and found["key"] == key and not diff_artifact(home / stage, job.hashes).describe():
+                artifacts.delete_folder(copy)
+                if found and found["key"] == key and not artifacts.diff_artifact(home / stage, job.hashes).describe():
                     shutil.copytree(home / stage, copy)
                     copy.rename(to)
                     return home.name
@@ -130,48 +111,30 @@ def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str 
 
 
 def _run_in_engine(
-    execution: Execution, job: ResolvedJob, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
-) -> dict[str, Any]:
-    """Run a stage's process by the engine, return its answer (see `worker.run`); raises Failed or KeyboardInterrupt."""
+    execution: Execution, job: ResolvedJob, stage: str, partial: Path, decisions: dict[str, Decision], lock: int
+) -> StageResult:
+    """Run a stage's process by the engine, and return its result; raises Failed or KeyboardInterrupt."""
     log = job.home / f"{stage}.log"
     needs = dict.fromkeys(job.pipeline.stages[stage].all_needs)
-    needs |= {need: job.folder if need == SCENE else earlier[need].path for need in used_needs(job, stage)}
+    needs |= {need: job.folder if need == SCENE else decisions[need].path for need in used_needs(job, stage)}
     line = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "needs": needs}
     task = Task(job.root, json.loads(json.dumps(line, default=str)), execution.output)
     gpus = int(job.params[stage].get("device") == "cuda")
     cores = (gpus and execution.gpu_cores) or execution.cores
-    resources = Resources(cores, gpus, expected_memory_mb(job, stage, needs))
     execution.on_change(stage, "waits")
+    resources = Resources(cores, gpus, execution.memory_mb(job, stage, needs))
     result = execution.engine.run(task, resources, lock, lambda: execution.on_change(stage, "runs"))
-    code, answer = result.code, result.answer
-    if code == 0 and answer:
-        return answer
-    how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
-    hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    error = answer.get("error", how + hint)
+    if result.code == 0 and result.answer:
+        return result
+    how = f"ended with code {result.code}"
+    if result.code < 0:
+        how = f"ended by signal {-result.code} ({signal.Signals(-result.code).name})"
+        how += "; out of memory?" * (result.code == -signal.SIGKILL)
+    error = result.answer.get("error", how)
     is_full = shutil.disk_usage(job.home).free < FULL_DISK_BYTES
     if is_full and REMEDIES[errno.ENOSPC] not in error:  # many libraries do not say that the disk is full
         error += f"; the disk is full: {REMEDIES[errno.ENOSPC]}"
     raise Failed(f"{stage}: {error} (all of it in {display_path(log)})")
-
-
-def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
-    """Estimate the CPU memory in MB to reserve for a stage.
-
-    It is 10 % above the largest peak of this stage in the receipts of the scene and its variants, whatever their
-    profile. Before the first run it follows from the size of all files in the folders of `needs`, by the table `memory`
-    of pipeline.yaml; 0 if the stage is not in the table.
-
-    Args:
-        job: the job.
-        stage: name of the stage.
-        needs: need -> folder; None if the need is skipped.
-    """
-    if peaks := [r["peak_memory_mb"] for r in earlier_receipts(job, stage) if r.get("peak_memory_mb")]:
-        return round(1.1 * max(peaks))
-    each = job.pipeline.memory.get(stage)
-    read = (path for folder in needs.values() if folder for path in list_files(folder))
-    return round(each.mb + each.each * sum(path.stat().st_size for path in read) / 2**20) if each else 0
 
 
 def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
@@ -182,7 +145,7 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         "key": inputs.key,
         **asdict(inputs),
         "profile": job.profile,
-        **hash_contents(folder, job.hashes),
+        **artifacts.hash_contents(folder, job.hashes),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
         "machine": MACHINE,
@@ -222,15 +185,15 @@ def run_scene(
         Refused: something that the user can correct is wrong or missing. Mostly this is raised before any stage runs.
         Failed: a stage fails.
     """
-    execution = execution or Execution(LocalEngine())
+    execution = execution or Execution()
     job = resolve(request, hashes)
     stages = job.pipeline.closure(target)
     with ExitStack() as locks:
         if job.home != job.base:
-            locks.enter_context(hold_lock(job.runs, job.base.name, shared=True))
-        lock = locks.enter_context(hold_lock(job.runs, job.home.name))
+            locks.enter_context(files.hold_lock(job.runs, job.base.name, shared=True))
+        lock = locks.enter_context(files.hold_lock(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
-        recover_swap(job.home, job.hashes)
+        artifacts.recover_swap(job.home, job.hashes)
         planned = plan(job, stages)
         say(plan_table(job, planned))
         _refuse_missing(job, planned)
@@ -240,22 +203,29 @@ def run_scene(
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
-            if job.keep and done[stage].status == "cached" and done[stage].path == job.home / stage:
-                accept_changes(job.home / stage, job.hashes)
-            if done[stage].status == "cached":  # repeat the stage's warnings; a stage that runs prints them itself
-                for warning in read_json(done[stage].path / "warnings.json") or ():
+            if done[stage].status == "cached":
+                if job.keep and done[stage].path == job.home / stage:
+                    artifacts.accept_changes(job.home / stage, job.hashes)
+                for warning in read_json(done[stage].path / "warnings.json") or ():  # a stage that runs prints its own
                     say(f"warning: {warning}")
-            if done[stage].status == "run":
+            elif done[stage].status == "run":
                 time_left = _time_left(job, {later: planned[later] for later in stages[position:]})
-                done[stage] = _run_stage(job, stage, done[stage], time_left, done, lock, execution)
-                if any(planned[later].status == "pending" for later in stages[position + 1 :]):
-                    planned = plan(job, stages, done)
-                    if not any(planned[later].status == "pending" for later in stages[position + 1 :]):
-                        say(plan_table(job, {later: planned[later] for later in stages[position + 1 :]}))
-                    _refuse_missing(job, planned)
+                done[stage] = _run_stage(job, stage, time_left, done, lock, execution)
+                planned = _plan_again(job, planned, done)
             execution.on_change(stage, "done")
         job.hashes.save()
     return {stage: decision.path for stage, decision in done.items()}
+
+
+def _plan_again(job: ResolvedJob, planned: dict[str, Decision], done: dict[str, Decision]) -> dict[str, Decision]:
+    """Return the plan after some stages are done, and print it once none of the others is pending any more."""
+    rest = [stage for stage in planned if stage not in done]
+    if any(planned[stage].status == "pending" for stage in rest):
+        planned = plan(job, list(planned), done)
+        if not any(planned[stage].status == "pending" for stage in rest):
+            say(plan_table(job, {stage: planned[stage] for stage in rest}))
+        _refuse_missing(job, planned)
+    return planned
 
 
 def _refuse_missing(job: ResolvedJob, planned: dict[str, Decision]) -> None:

@@ -48,9 +48,8 @@ def write_text(path: Path, text: str) -> None:
     try:
         partial.write_text(text, encoding="utf-8")
         os.replace(partial, path)
-    except OSError:
+    finally:
         partial.unlink(missing_ok=True)
-        raise
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -107,9 +106,7 @@ def hold_lock(runs: Path, name: str, shared: bool = False, wait: bool = True) ->
         _lock(file.fileno(), name, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, wait)
         _, host = _holder(file.fileno())
         if host not in ("", MACHINE):
-            say(
-                f"{name} was last in use on {host}; is it still? One machine at a time may work in {display_path(runs)}"
-            )
+            say(f"{name} was last in use on {host}; is it still? Only one at a time may work in {display_path(runs)}")
         if not shared:
             _sign(file.fileno(), f"{os.getpid()} {MACHINE}\n")
         yield file.fileno()
@@ -123,7 +120,8 @@ def _lock(lock: int, name: str, mode: int, wait: bool) -> None:
         fcntl.flock(lock, mode | fcntl.LOCK_NB)
     except BlockingIOError:
         process, host = _holder(lock)
-        holder = f"{name} is in use by process {process or '?'}" + (f" on {host}" if host not in ("", MACHINE) else "")
+        on = f" on {host}" if host not in ("", MACHINE) else ""
+        holder = f"{name} is in use by process {process or '?'}{on}"
         if not wait:
             raise Refused(f"{holder}; stop it, or wait for its end") from None
         say(f"{holder}: waiting for its end")
@@ -176,33 +174,29 @@ def check_lock(lock: int) -> None:
         raise Failed("its lock in .locks was removed, so another process may be at work here; the same command goes on")
 
 
-def export_folders(new: Path, old: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
+def export_folders(new: Path, old: Path, home: Path, names: tuple[str, ...]) -> None:
     """Copy folders of a new artifact to `home`, where people work with them.
 
-    This is a generator: it copies while the caller iterates over the messages. Earlier exported files that nobody
-    changed are replaced, or removed if the new artifact does not have them. Files that a person changed or added are
-    kept, and the new files of the same names are not copied.
+    Earlier exported files that nobody changed are replaced, or removed if the new artifact does not have them. Files
+    that a person changed or added are kept, and the new files of the same names are not copied; a message names them.
 
     Args:
         new: folder of the new artifact.
         old: folder of the artifact that `new` will replace.
         home: folder of the results of the scene, to which the folders are copied.
         names: names of the folders to copy, in `new` and in `home`.
-
-    Yields:
-        A message for each file that is kept.
     """
     for name in names:
         for path in list(list_files(home / name)):
             twins = [artifact / path.relative_to(home) for artifact in (old, new)]
             if any(twin.is_file() and filecmp.cmp(path, twin, shallow=False) for twin in twins):
                 path.unlink()
-        kept = [path.relative_to(home) for path in list_files(home / name)]
+            else:
+                say(f"{home.name}/{path.relative_to(home)} was changed by hand: kept")
         for path in list_files(new / name):
-            relative = path.relative_to(new)
-            if relative not in kept:
-                (home / relative).parent.mkdir(parents=True, exist_ok=True)
-                partial = (home / relative).with_name(f".{relative.name}.writing")
+            place = home / path.relative_to(new)
+            if not place.exists():
+                place.parent.mkdir(parents=True, exist_ok=True)
+                partial = place.with_name(f".{place.name}.writing")
                 shutil.copy2(path, partial)
-                partial.replace(home / relative)
-        yield from (f"{home.name}/{relative} was changed by hand: kept" for relative in kept)
+                partial.replace(place)

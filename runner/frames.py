@@ -33,14 +33,11 @@ def update_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None
     ours = [folder / name for name in FRAME_FILES]
     others = [path for path in list_files(folder) if path not in ours and path.parent != folder / "images"]
     if found and (others or found["video"] != str(video)):
-        raise Refused(
-            f"{display_path(folder)} holds frames of another video, {found['video']} as it was"
-            + (f", and {display_path(others[0])} for them" if others else "")
-            + "; rename the video, or move that folder away"
-        )
+        of = f"frames of another video, {found['video']} as it was"
+        of += f", and {display_path(others[0])} for them" if others else ""
+        raise Refused(f"{display_path(folder)} holds {of}; rename the video, or move that folder away")
     process = start_worker(root, "frames", stdout=subprocess.PIPE)
-    question = {"video": str(video), "folder": str(folder), "content": content}
-    message, _ = process.communicate(json.dumps(question))
+    message, _ = process.communicate(json.dumps({"video": str(video), "folder": str(folder), "content": content}))
     if process.returncode:
         raise Refused(message.strip() or f"{video}: its frames could not be taken (see above)")
     say(message.strip())

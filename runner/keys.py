@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import threading
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,11 +25,15 @@ _PARSING = threading.Lock()  # CPython 3.11 raises SystemError where two threads
 
 def digest(*parts: str) -> str:
     """Hash a sequence of texts to 20 hexadecimal digits."""
-    state = hashlib.blake2b(digest_size=10)
-    for part in parts:
-        data = part.encode()
-        state.update(len(data).to_bytes(8, "little") + data)
-    return state.hexdigest()
+    encoded = [part.encode() for part in parts]
+    lengths = (len(part).to_bytes(8, "little") + part for part in encoded)
+    return hashlib.blake2b(b"".join(lengths), digest_size=10).hexdigest()
+
+
+def _hash_content(path: Path) -> str:
+    """Hash the content of a file to 20 hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
 def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
@@ -58,9 +61,7 @@ class Hashes:
         known: the entries of the cache.
     """
 
-    LIMIT = 1_000_000  # number of entries that are saved, the newest ones; a demo scene and its results have 1,000
-    # If a save took more than SLOW seconds, the next one waits WAIT times as long as that save took.
-    SLOW, WAIT = 0.1, 50
+    LIMIT = 100_000  # number of entries that are saved, the newest ones; a demo scene and its results have 1,000
 
     def __init__(self, path: Path, recompute: bool = False):
         """Load the cache from `path`; it starts empty if there is no such file. For the arguments see the class."""
@@ -69,7 +70,6 @@ class Hashes:
         found = read_json(path)
         self.known: dict[str, Any] = found if isinstance(found, dict) else {}
         self._saved, self._saving = 0 if recompute else len(self.known), threading.Lock()
-        self._took, self._at = 0.0, 0.0  # duration of the last save, and its time; seconds
         self._imports: dict[tuple[Path, str], list[Path]] = {}  # (module, fingerprint) -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
@@ -84,12 +84,7 @@ class Hashes:
 
     def file(self, path: Path) -> str:
         """Return the hash of a file's content."""
-
-        def content(path: Path) -> str:
-            with open(path, "rb") as file:
-                return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
-
-        return self._remember("file", path, content)
+        return self._remember("file", path, _hash_content)
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
         """Return the fingerprint of a Python file, and the files of CODE_PACKAGES that it imports itself.
@@ -103,10 +98,10 @@ class Hashes:
         Raises:
             Refused: the file is not valid Python.
         """
-        names, fingerprint = self._remember("module", path, _read_module)
-        if (path, fingerprint) not in self._imports:
-            self._imports[path, fingerprint] = list(_imported_files(names, path, root))
-        return fingerprint, self._imports[path, fingerprint]
+        names, code = self._remember("module", path, _read_module)
+        if (path, code) not in self._imports:
+            self._imports[path, code] = list(_imported_files(names, path, root))
+        return code, self._imports[path, code]
 
     def folder(self, folder: Path, exclude: tuple[str, ...] = NOT_CONTENT) -> str:
         """Return one hash of the names and contents of all files below a folder. Hidden files are left out.
@@ -137,9 +132,8 @@ class Hashes:
         return self.file(folder) if folder.is_file() else self.files(folder, read)
 
     def save(self) -> None:
-        """Write the cache to its file, unless it has no new entries, or the last save was slow and recent."""
-        started = time.monotonic()
-        if len(self.known) == self._saved or (self._took > self.SLOW and started - self._at < self.WAIT * self._took):
+        """Write the cache to its file, unless it has no new entries."""
+        if len(self.known) == self._saved:
             return
         kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
         # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
@@ -147,8 +141,7 @@ class Hashes:
             partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)
-            self._saved, self._at = len(self.known), time.monotonic()
-            self._took = self._at - started
+            self._saved = len(self.known)
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
@@ -287,7 +280,7 @@ class Inputs:
     def keyed(self, params: dict[str, Any]) -> dict[str, Any]:
         """Flatten `params` to a dict dotted name -> value, without `unkeyed`, which are not part of the key."""
         inside = tuple(f"{name}." for name in self.unkeyed)
-        return {n: v for n, v in flatten_params(params).items() if n not in self.unkeyed and not n.startswith(inside)}
+        return {n: v for n, v in flatten_params(params).items() if not f"{n}.".startswith(inside)}
 
 
 def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -305,38 +298,34 @@ def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """Describe the differences between a receipt, `old`, and the current inputs, a phrase each; code comes last.
+    """Describe the differences but those of code between a receipt, `old`, and the current inputs, a phrase each.
 
     Parameters that do not change the artifact are not compared. An optional feature counts as a difference if the
-    machine lacked it at the time of the receipt and has it now. The list is empty if the artifact is up to date.
+    machine lacked it at the time of the receipt and has it now.
     """
-    found, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
+    before, after = new.keyed(old["params"]), new.keyed(new.params)
+    found = []
     for name in sorted({*before, *after}):
-        if name not in after:
-            found.append(f"param {name} is gone")
-        elif name not in before:
-            found.append(f"param {name} is new")
+        if name not in after or name not in before:
+            found.append(f"param {name} is {'new' if name in after else 'gone'}")
         elif before[name] != after[name]:
             found.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
-    needs = [name for name in sorted({*old["needs"], *new.needs}) if old["needs"].get(name) != new.needs.get(name)]
-    weights = [
-        name for name in sorted({*old["weights"], *new.weights}) if old["weights"].get(name) != new.weights.get(name)
-    ]
-    found += [f"{_name_need(need)} changed" for need in needs] + [f"weights {name} changed" for name in weights]
-    found += [f"{name} is on this machine now" for name in old.get("unavailable", ()) if name not in new.unavailable]
-    return found + list_code_changes(old, new)
+    for need in _differing(old["needs"], new.needs):
+        whole, _, part = need.partition(": ")
+        found.append(f"the scene's {part or 'files'} changed" if whole == "scene" else f"the result of {need} changed")
+    found += [f"weights {name} changed" for name in _differing(old["weights"], new.weights)]
+    gained = (name for name in old.get("unavailable", ()) if name not in new.unavailable)
+    return found + [f"{name} is on this machine now" for name in gained]
 
 
-def _name_need(need: str) -> str:
-    """Return the name of a need for people: of a stage, "scene" or "scene: <part>"."""
-    whole, _, part = need.partition(": ")
-    return f"the scene's {part or 'files'}" if whole == "scene" else f"the result of {need}"
+def _differing(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Return the keys with different values in two dicts, sorted; a value of None is as good as none."""
+    return [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
 
 
 def list_code_changes(old: dict[str, Any], new: Inputs) -> list[str]:
     """Describe which files of code differ between a receipt, `old`, and the current inputs, a phrase each."""
-    files = sorted({*old["code"], *new.code})
-    return [f"code of {name} changed" for name in files if old["code"].get(name) != new.code.get(name)]
+    return [f"code of {name} changed" for name in _differing(old["code"], new.code)]
 
 
 def _short(value: Any) -> str:

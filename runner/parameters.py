@@ -56,9 +56,9 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
             value = parse_value(value_text, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
         except ValueError:
             raise Refused(f"set: the value of {stage}{names} is not valid YAML: {value_text!r:.60}") from None
-        for name in reversed(names[1:].split(".")):
+        for name in reversed(f"{stage}{names}".split(".")):
             value = {name: value}
-        overrides[stage] = merge_params(overrides.get(stage, {}), value)
+        overrides = merge_params(overrides, value)
     return overrides
 
 
@@ -174,10 +174,9 @@ def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overr
     """
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
-    set_params = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}
-    has_values = lambda expected: all(set_params.get(param, ...) == value for param, value in expected.items())
-    is_true = lambda c: c.param and has_values(dict.fromkeys(c.param, c.equals) | c.only)
-    remaining = [name for name in pipeline.budget if not any(is_true(c) for c in pipeline.stages[name].skip_if)]
+    asked = flatten_params(values).items()
+    is_true = lambda condition: condition.param and condition.expected.items() <= asked
+    remaining = [name for name in pipeline.budget if not any(map(is_true, pipeline.stages[name].skip_if))]
     if not remaining:
         return {}
     scale = sum(pipeline.budget.values()) / sum(pipeline.budget[name] for name in remaining)

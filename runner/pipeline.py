@@ -5,7 +5,6 @@ Parameters are named `<stage>.<name>` here, with dots for groups, such as `disti
 
 import difflib
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -56,15 +55,15 @@ class Condition(Strict):
         return self
 
     @property
+    def expected(self) -> dict[str, Any]:
+        """The parameters, <stage>.<name>, that must have certain values if the condition is true, with these values."""
+        return self.only | dict.fromkeys(self.param, self.equals)
+
+    @property
     def names(self) -> tuple[str, str]:
         """The stage that the condition tests, and the name of the (first) fact, parameter or folder."""
         stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
-
-    @property
-    def depends_on(self) -> tuple[str, ...]:
-        """The stage that must be done before the condition can be tested; empty for a test of parameters."""
-        return () if self.param else self.names[:1]
 
 
 class Substitute(Strict):
@@ -124,6 +123,13 @@ class Stage(Strict):
         """All needs, optional ones last. They are the keyword arguments of the stage's run()."""
         return (*self.needs, *self.optional)
 
+    @property
+    def depends_on(self) -> tuple[str, ...]:
+        """All needs, and the stages that must be done before a condition can be tested or the stage be replaced."""
+        tested = (condition.names[0] for condition in self.skip_if if not condition.param)
+        replaced = [self.provided.artifact] if self.provided else []
+        return (*self.all_needs, *tested, *replaced, *([self.ignore.need] if self.ignore else []))
+
 
 class Memory(Strict):
     """The expected CPU memory of a stage: `mb` MB, and `each` MB more per MB of files in the folders of its needs."""
@@ -182,25 +188,13 @@ class Pipeline(Strict):
     def _names_are_known(self) -> Self:
         earlier = [SCENE]
         for name, stage in self.stages.items():
-            referenced = [*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)]
-            referenced += [stage.provided.artifact] if stage.provided else []
-            referenced += [stage.ignore.need] if stage.ignore else []
-            for need in referenced:
-                if need not in earlier:
-                    raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
+            for need in (need for need in stage.depends_on if need not in earlier):
+                raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
             earlier.append(name)
-        tables: dict[str, Iterable[str]] = {
-            "scene_keys": self.scene_keys,
-            "budget": self.budget,
-            "memory": self.memory,
-            **self.durations,
-            **self.profiles,
-            **self.variants,
-        }
-        for label, layer in tables.items():
-            for stage in layer:
-                if stage not in self.stages:
-                    raise ValueError(f"{label} names {unknown_name('stage', stage, self.stages)}")
+        tables: dict[str, Any] = {"scene_keys": self.scene_keys, "budget": self.budget, "memory": self.memory}
+        named = [*tables.items(), *self.durations.items(), *self.profiles.items(), *self.variants.items()]
+        for label, stage in ((label, stage) for label, table in named for stage in table if stage not in self.stages):
+            raise ValueError(f"{label} names {unknown_name('stage', stage, self.stages)}")
         for name in (name for pair in self.comparisons.items() for name in pair if name not in self.profiles):
             raise ValueError(f"comparisons names {unknown_name('profile', name, self.profiles)}")
         if sum(self.budget.values()) > 1:
@@ -223,8 +217,7 @@ class Pipeline(Strict):
         names = {target}
         for name in reversed(self.stages):
             if name in names:
-                stage = self.stages[name]
-                names |= {*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)}
+                names |= {*self.stages[name].depends_on}
         return [name for name in self.stages if name in names]
 
 
@@ -269,8 +262,8 @@ def load_pipeline(root: Path) -> Pipeline:
         return Pipeline.model_validate(read_yaml(path))
     except ValidationError as error:
         first = error.errors()[0]
-        where = "".join(f"{part}." for part in first["loc"])[:-1]
-        raise Refused(f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}") from None
+        where = ".".join(map(str, first["loc"])) + ": " * bool(first["loc"])
+        raise Refused(f"{path}: {where}{first['msg'].removeprefix('Value error, ')}") from None
 
 
 @dataclass(frozen=True)
@@ -328,19 +321,11 @@ def find_scene(text: str, root: Path) -> Path:
     """
     scene = scene_path(text, root)
     if scene is not None:
-        if not NAME.fullmatch(scene_name(scene)):
-            raise Refused(
-                f"{scene}: a scene is called by its folder's name; use letters, digits, blanks and _ . , - + ' ( ) only"
-            )
-        return scene
-    data = workplace(root) / "data"
-    known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
-    here = (
-        "no folder or video at that path"
-        if Path(text).is_absolute()
-        else f"no folder data/{text}, nor one or a video at that path"
-    )
-    raise Refused(
-        f"unknown scene {text!r}: there is {here}; "
-        f"known: {', '.join(known) or 'none'} (`reffusion demo` makes data/demo)"
-    )
+        if NAME.fullmatch(scene_name(scene)):
+            return scene
+        allowed = "letters, digits, blanks and _ . , - + ' ( )"
+        raise Refused(f"{scene}: a scene is called by its folder's name; use {allowed} only")
+    known = ", ".join(sorted(path.name for path in (workplace(root) / "data").glob("[!._]*/"))) or "none"
+    absent = "folder or video" if Path(text).is_absolute() else f"folder data/{text}, nor one or a video"
+    where = f"there is no {absent} at that path; known: {known} (`reffusion demo` makes data/demo)"
+    raise Refused(f"unknown scene {text!r}: {where}")

@@ -10,18 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from runner import Refused
+from runner import Refused, keys
 from runner.artifacts import ArtifactDiff, diff_artifact
 from runner.files import RECEIPT, list_files, read_receipt
-from runner.keys import (
-    Inputs,
-    code_fingerprints,
-    digest,
-    flatten_params,
-    list_changes,
-    list_code_changes,
-    paths_outside,
-)
+from runner.keys import Inputs, digest, flatten_params
 from runner.pipeline import SCENE, Condition
 from runner.process import ask_stages
 from runner.resolve import ResolvedJob, has_cuda
@@ -99,7 +91,7 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
             return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
-    code = code_fingerprints(job.root, stage, job.hashes)
+    code = keys.code_fingerprints(job.root, stage, job.hashes)
     if open_questions:
         return Decision("pending", open_questions[0], _existing_artifact(job, stage))
     changing = [need for need, decision in needs.items() if not decision.is_final]
@@ -110,8 +102,7 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
             return Decision("run", "not run yet")
         info = job.stages[stage]
         same_needs = Inputs(info.params, found["needs"], found["weights"], code, info.unkeyed, info.unavailable)
-        differences = [] if job.trust else list_changes(found, same_needs)
-        if differences or (differences := _damage(job, diff_artifact(path, job.hashes))):
+        if differences := _changes(job, found, same_needs) or _damage(job, diff_artifact(path, job.hashes)):
             return Decision("run", join_names(differences), path)
         return Decision("stale", f"waits for {', '.join(changing)}; kept if the new content is the same", path)
     return _compare_receipts(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
@@ -130,12 +121,11 @@ def used_needs(job: ResolvedJob, stage: str) -> list[str]:
 def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Evaluate a condition of pipeline.yaml; None if an earlier stage must run before the answer is known."""
     stage, name = condition.names
-    if job.brings.intersection(condition.unless):
-        return False
-    if not all(_has_value(job, param, value) for param, value in condition.only.items()):
+    expected = condition.expected.items()
+    if job.brings.intersection(condition.unless) or not all(_has_value(job, *each) for each in expected):
         return False
     if condition.param:
-        return all(_has_value(job, param, condition.equals) for param in condition.param)
+        return True
     source = earlier[stage]
     if source.status == "skip":
         return False
@@ -193,7 +183,7 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].all_needs:
         hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
-        for path in paths_outside(own.params, job.folder):
+        for path in keys.paths_outside(own.params, job.folder):
             if job.folder.is_relative_to(path):
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
@@ -204,29 +194,32 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
 def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
     """Return `cached` if a receipt, of the variant or else the scene, agrees with inputs and files; otherwise `run`."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
-    receipts = [(place, list_changes(found, inputs), found) for place in places if (found := read_receipt(place))]
-    reasons = []
-    for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
-        notes = [] if place.parent == job.home else [f"shared with {job.base.name}"]
+    receipts = [(place, found) for place in places if (found := read_receipt(place))]
+    reasons = ["not run yet"] * (not receipts)
+    for place, found in sorted(receipts, key=lambda receipt: bool(_changes(job, receipt[1], inputs))):
         diff = diff_artifact(place, job.hashes)
-        # With `trust`, differences of code alone are accepted.
-        if differs and not (job.trust and differs == list_code_changes(found, inputs)):
-            reasons.append(differs)
-        elif harm := _damage(job, diff):
-            reasons.append(harm)
-        else:
-            notes = [f"trusted although {join_names(differs)}"] if differs else notes
-            return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
+        if differences := _changes(job, found, inputs) or _damage(job, diff):
+            reasons.append(join_names(differences))
+            continue
+        trusted = join_names(keys.list_code_changes(found, inputs))
+        shared = f"shared with {job.base.name}" if place.parent != job.home else ""
+        notes = filter(None, [f"trusted although {trusted}" if trusted else shared])
+        return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
     resumes = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    why = join_names(reasons[0]) if reasons else "not run yet"
-    return Decision("run", why + resumes, receipts[0][0] if receipts else None, False, inputs)
+    return Decision("run", reasons[0] + resumes, receipts[0][0] if receipts else None, False, inputs)
+
+
+def _changes(job: ResolvedJob, receipt: dict[str, Any], inputs: Inputs) -> list[str]:
+    """Describe the differences between a receipt and inputs, a phrase each; with `trust`, not those of code."""
+    return keys.list_changes(receipt, inputs) + ([] if job.trust else keys.list_code_changes(receipt, inputs))
 
 
 def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
     """Return why an artifact cannot be used, as phrases: missing files and, without `keep`, changed files; else []."""
-    missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
-    changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
-    return missing + changed
+    found = [f"{join_names(diff.missing)} missing"] if diff.missing else []
+    if diff.changed and not job.keep:
+        found.append(f"{join_names(diff.changed)} changed since (keep=1 keeps it)")
+    return found
 
 
 def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
@@ -279,11 +272,12 @@ def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]
     """Build a stage's question (`worker.describe`); if the stage may run, the paths of its needs ask for a preview."""
     spec, question = job.pipeline.stages[stage], job.question(stage)
     # A stage that reads the scene is asked before its other needs have run, so that it can refuse the scene early.
+    reads_scene = SCENE in spec.all_needs
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}
-    needs = {need: each.path for need, each in others.items() if each.is_final or SCENE not in spec.all_needs}
-    needs |= {SCENE: job.folder} if SCENE in spec.all_needs else {}
-    if decisions[stage].status in TO_DO and (SCENE in needs or all(map(needs.get, spec.needs))):
-        question["needs"] = {need: str(path) if (path := needs.get(need)) else None for need in spec.all_needs}
+    needs = {need: each.path if each.is_final or not reads_scene else None for need, each in others.items()}
+    needs |= {SCENE: job.folder} if reads_scene else {}
+    if decisions[stage].status in TO_DO and (reads_scene or all(map(needs.get, spec.needs))):
+        question["needs"] = {need: path and str(path) for need, path in needs.items()}
     return question
 
 
@@ -295,7 +289,8 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
     if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # None: stages run on this machine
         reason = f"{question['stage']}.device is cuda, and {absent[0]}"
         return Decision("missing", reason, needed=needed, lacks=absent)
-    cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]
+    cure = f"`make weights profile={job.profile}` fetches it"
+    lacks = [need for need in needed if need["problem"]]
     for need in (need for need in lacks if not need["optional"]):
         fetch = f"; {cure} ({format_bytes(need['bytes'])})" if need["fetched"] else ""
         return Decision("missing", need["problem"] + fetch, needed=needed)

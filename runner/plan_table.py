@@ -1,9 +1,8 @@
-"""A plan for readers: the text that `plan` prints, and `run` before it starts, and the record for pages."""
+"""A plan as text, which `plan` prints, and `run` before it starts."""
 
-import os
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from runner.durations import expected_seconds, is_timed, total_time
 from runner.keys import files_outside, paths_outside
@@ -33,39 +32,18 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {format_bytes(sum(sizes))}, by `make weights profile={job.profile}`")
-    if paths := _paths_outside_scene(job, list(decisions)):
-        folders = Counter(str(path if path.is_dir() else path.parent) for path in paths)
-        named = [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]
+    paths = {path for stage in decisions for path in _paths_outside_scene(job, stage)}
+    folders = Counter(str(path if path.is_dir() else path.parent) for path in sorted(paths))
+    if named := [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]:
         lines.append(f"  read outside the scene's folder: {join_names(named)}")
     return "\n".join(lines)
 
 
-def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
-    """Return the paths outside the scene's folder that stages read, sorted; scene.yaml or capture files name them."""
-    readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
-    reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
-    named = [
-        path
-        for stage in readers
-        if job.stages[stage].reads is None
-        for path in paths_outside(job.params[stage], job.folder)
-    ]
-    return sorted({*reads, *named})
-
-
-def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
-    """Return the content of plan.json, which the report reads.
-
-    Args:
-        job: the job.
-        decisions: the plan, stage -> decision.
-        unset: the same job without `set=` and `budget=`, whose parameters are recorded.
-
-    Returns:
-        "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
-        None, "seconds": see `expected_seconds`}; "params": stage -> all parameters of `unset`.
-    """
-    folder = lambda path: path and os.path.relpath(path, job.runs)
-    entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
-    stages = {stage: entry(d) | {"seconds": expected_seconds(job, stage)} for stage, d in decisions.items()}
-    return {"profile": job.profile, "stages": stages, "params": unset.params}
+def _paths_outside_scene(job: ResolvedJob, stage: str) -> Iterable[Path]:
+    """Return the paths outside the scene's folder that a stage reads; scene.yaml or capture files name them."""
+    info = job.stages.get(stage)
+    if info is None or SCENE not in job.pipeline.stages[stage].all_needs:
+        return ()
+    if info.reads is None:
+        return paths_outside(info.params, job.folder)
+    return files_outside(info.reads, job.folder)

@@ -16,15 +16,7 @@ from runner.files import list_files, read_text
 from runner.frames import FRAMES, update_frames
 from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, flatten_params, paths_outside
 from runner.parameters import Layers, parse_duration, parse_set, split_budget, stack_layers
-from runner.pipeline import (
-    SCENE,
-    Pipeline,
-    SceneFile,
-    find_scene,
-    load_pipeline,
-    load_scene_file,
-    unknown_name,
-)
+from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, unknown_name
 from runner.process import ask_stages
 
 AUTO = "auto"  # stands for the profile that suits this machine
@@ -90,14 +82,12 @@ class StageInfo:
     unavailable: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class ResolvedJob:
+@dataclass(frozen=True, kw_only=True)
+class ResolvedJob(Request):
     """A job: one scene, or a variant of it, with all its settings, resolved and checked.
 
     Attributes:
-        root, runs, trust, keep, cuda, gpu: as in `Request`.
         folder: the scene's folder; the root for a job without a scene.
-        home: folder of this run, runs/<scene> or runs/<scene>@<variant>.
         base: folder of the scene's own run, runs/<scene>, whose artifacts variants share.
         pipeline: the content of pipeline.yaml.
         layers: the parameters as the user and the files ask for them, without the defaults in the stages' code.
@@ -109,23 +99,21 @@ class ResolvedJob:
         broken: stage that cannot be imported -> the error.
     """
 
-    root: Path
-    runs: Path
     folder: Path
-    home: Path
     base: Path
     pipeline: Pipeline
     layers: Layers
     profile: str
     why: str
-    trust: bool
     brings: frozenset[str]
     hashes: Hashes
-    keep: bool = False
-    cuda: bool | None = None
-    gpu: str | None = None
     stages: dict[str, StageInfo] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def home(self) -> Path:
+        """The folder of this run, runs/<scene> or runs/<scene>@<variant>."""
+        return variant_folder(self.base, self.variant)
 
     @property
     def params(self) -> dict[str, dict[str, Any]]:
@@ -167,32 +155,32 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
     questions = [_questions(job) for job in drafts]
     new = {name: question for each in questions for name, question in each.items() if name not in hashes.known}
     answers = dict(zip(new, ask_stages(requests[0].root, list(new.values())), strict=True))
-    may_cache = lambda key, answer: (
-        key.startswith(CACHED) and "params" in answer and not (answer.get("unavailable") or answer.get("machine"))
-    )
-    inside = lambda question, answer: (
-        not any(files_outside(answer.get("reads") or (), Path(question.get("scene", "."))))
-    )
-    hashes.known |= {k: answer for k, answer in answers.items() if may_cache(k, answer) and inside(new[k], answer)}
+    for key, answer in answers.items():
+        depends_on_machine = answer.get("unavailable") or answer.get("machine")
+        outside = files_outside(answer.get("reads") or (), Path(new[key].get("scene", ".")))
+        if key.startswith(CACHED) and "params" in answer and not depends_on_machine and not outside:
+            hashes.known[key] = answer
     return [_add_descriptions(job, each, hashes.known | answers) for job, each in zip(drafts, questions, strict=True)]
 
 
 def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
     """Resolve everything of a request but the descriptions of the stages; for the arguments see `resolve`."""
-    root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
-    source = find_scene(request.scene, root) if scene else None
-    base = runs / (scene_name(source) if source else "")
-    folder = base / FRAMES if source and source.is_file() else source
-    check_unique_name(base, folder, root)
-    if source and folder and folder != source:
-        update_frames(source, folder, root, hashes)
-    found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
+    root, variant, pipeline = request.root, request.variant, load_pipeline(request.root)
+    base, folder, found = request.runs, root, SceneFile(root / "scene.yaml", None, {}, {})
+    if scene:
+        source = find_scene(request.scene, root)
+        base = request.runs / scene_name(source)
+        folder = base / FRAMES if source.is_file() else source
+        check_unique_name(base, folder, root)
+        if source.is_file():
+            update_frames(source, folder, root, hashes)
+        found = load_scene_file(folder, pipeline)
     if request.gpu and request.gpu not in pipeline.gpus:
         raise Refused(f"gpu={request.gpu}: {unknown_name('GPU', request.gpu, pipeline.gpus)}")
     if variant and variant not in pipeline.variants:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown_name('variant', variant, pipeline.variants)}")
-    home = base.with_name(f"{base.name}@{variant}") if variant else base
-    profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline, request.cuda)
+    pinned = [home / "profile" for home in (variant_folder(base, variant), base)]
+    profile, why = choose_profile(request.profile, found, pinned, pipeline, request.cuda)
     if request.compared and profile in pipeline.comparisons:
         profile, why = pipeline.comparisons[profile], f"methods of the profile {profile} are compared in it"
     layer = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
@@ -200,9 +188,9 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
     if request.budget or found.budget is not None:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = stack_layers(*layer, split_budget(pipeline, layers.values, parse_duration(text, origin)))
-    keys = frozenset(found.brings)
-    folders, options = (root, runs, folder or root, home, base), (request.keep, request.cuda, request.gpu)
-    return ResolvedJob(*folders, pipeline, layers, profile, why, request.trust, keys, hashes, *options)
+    settings = {"folder": folder, "base": base, "pipeline": pipeline, "layers": layers, "hashes": hashes}
+    settings |= {"profile": profile, "why": why, "brings": frozenset(found.brings)}
+    return ResolvedJob(**vars(request) | settings)
 
 
 def choose_profile(
@@ -232,10 +220,8 @@ def choose_profile(
         origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
         if record := next((path for path in pinned if read_text(path)), None):
             origin, profile, why = str(record), read_text(record), "this scene was run with it"
-        elif cuda:
-            profile, why = "paper", "the cluster has GPUs"
-        elif cuda is None and has_cuda():
-            profile, why = "paper", "this machine has a CUDA driver"
+        elif has_cuda() if cuda is None else cuda:
+            profile, why = "paper", "this machine has a CUDA driver" if cuda is None else "the cluster has GPUs"
     if profile not in pipeline.profiles:
         raise Refused(f"{origin}: {unknown_name('profile', profile, [AUTO, *pipeline.profiles])}")
     return profile, why
@@ -251,16 +237,21 @@ def has_cuda() -> bool:
     return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))
 
 
-def check_unique_name(base: Path, folder: Path | None, root: Path) -> None:
+def variant_folder(base: Path, variant: str | None) -> Path:
+    """Return the folder of a variant's run beside that of the scene's own run, `base`; None stands for the latter."""
+    return base.with_name(f"{base.name}@{variant}") if variant else base
+
+
+def check_unique_name(base: Path, folder: Path, root: Path) -> None:
     """Raise Refused if the artifacts in `base` were made from another scene with the same name.
 
     Args:
         base: folder of the scene's artifacts, runs/<scene>.
-        folder: folder of the scene; None for a job without a scene.
+        folder: folder of the scene.
         root: folder with pipeline.yaml.
     """
     before = root / read_text(base / "source")
-    if folder and before not in (root, folder) and before.is_dir():
+    if before not in (root, folder) and before.is_dir():
         raise Refused(
             f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
             f"rename one folder, or make room with `make scene={shlex.quote(str(before))} clean`"

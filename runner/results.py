@@ -1,4 +1,4 @@
-"""Printing of a run's scores, and calls of report/ for tables and pages."""
+"""Printing of a run's scores, records for report/, and calls of report/ for tables and pages."""
 
 import os
 import subprocess
@@ -8,9 +8,11 @@ from typing import Any
 
 from reffusion.command import is_installed, workplace
 from runner import Failed, say
+from runner.durations import expected_seconds
 from runner.files import RECEIPT, read_json
+from runner.plan import Decision
 from runner.process import PROJECT
-from runner.resolve import Request
+from runner.resolve import Request, ResolvedJob
 from runner.text import display_path
 
 SCENE_FILE = "scene.ply"  # file with the result in the artifact of the stage `evaluate`
@@ -63,6 +65,24 @@ def format_command(request: Request, command: str) -> str:
     if is_installed(request.root):
         return f"reffusion {command} " + " ".join(f"--{name} {value}" for name, value in options.items() if value)
     return "make " + " ".join(f"{name}={value}" for name, value in options.items() if value) + f" {command}"
+
+
+def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
+    """Return the content of plan.json, which the report reads.
+
+    Args:
+        job: the job.
+        decisions: the plan, stage -> decision.
+        unset: the same job without `set=` and `budget=`, whose parameters are recorded.
+
+    Returns:
+        "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
+        None, "seconds": see `expected_seconds`}; "params": stage -> all parameters of `unset`.
+    """
+    folder = lambda path: path and os.path.relpath(path, job.runs)
+    entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
+    stages = {stage: entry(d) | {"seconds": expected_seconds(job, stage)} for stage, d in decisions.items()}
+    return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
 def write_table(record: Path) -> None:

@@ -1,7 +1,7 @@
 """The process that imports stages, started as `python -m runner.worker <command>`.
 
-The command is `describe` (answers questions about stages), `fetch` (downloads the weights that stages need), `frames`
-(extracts the frames of a video) or `run` (runs a stage). Input is read from the standard input.
+The command is `describe` (answers questions about stages), `frames` (extracts the frames of a video) or `run` (runs a
+stage). Input is read from the standard input.
 
 The description of a stage is a module with the class Params and optional functions (needed_weights, unavailable,
 optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
@@ -23,6 +23,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import NoneType, UnionType
@@ -38,13 +39,13 @@ CUDA_FILE = Path("stages/plan/cuda.py")  # relative to the root
 THREADS = ("OMP", "MKL", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
 
 
-def _description_file(stage: str) -> Path:
+def description_file(stage: str) -> Path:
     """Return the file that describes a stage, relative to the root, which is the working directory."""
     path = Path(f"stages/plan/{stage}.py")
     return path if path.is_file() else Path(f"stages/{stage}.py")
 
 
-def _import_file(path: Path) -> Any:
+def import_file(path: Path) -> Any:
     """Import a Python file, whose path is relative to the root, as a module."""
     return importlib.import_module(".".join(path.with_suffix("").parts))
 
@@ -70,51 +71,60 @@ def describe() -> None:
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
-    needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
-    path = _description_file(stage)
+    path = description_file(stage)
     try:
-        planned = _import_file(path)
+        planned = import_file(path)
         path = Path(f"stages/{stage}.py")
         _check_run(path, question["takes"])
     except Exception as error:
         return {"broken": f"{path}: {format_error(error)}"}  # the stage's code has an error
     fields = dict(_fields(planned.Params))
     try:
-        resolved = planned.Params(**question["params"])
+        params = planned.Params(**question["params"])
     except ValidationError as error:
         return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
-    marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
-    answer: dict[str, Any] = {
-        "params": resolved.model_dump(mode="json"),
-        "weights": [name for name, extra in marks.items() if extra.get("weights")],
-        "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
-        "programs": [name for name, extra in marks.items() if extra.get("program")],
-    }
+    marked = lambda mark, value: [name for name, marks in fields.items() if (marks or {}).get(mark) is value]
+    answer = {"params": params.model_dump(mode="json"), "weights": marked("weights", True)}
+    answer |= {"unkeyed": marked("keyed", False), "programs": marked("program", True)}
     if hasattr(planned, "machine_facts"):
-        answer["machine"] = planned.machine_facts(resolved)
-    if brings is not None and hasattr(planned, "optional_weights"):
-        answer["optional"] = [asdict(need) for need in planned.optional_weights(resolved)]
+        answer["machine"] = planned.machine_facts(params)
     if hasattr(planned, "unavailable"):
-        answer["unavailable"] = planned.unavailable(resolved)
-    if brings is not None and hasattr(planned, "needed_weights"):
-        answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
-    if brings is not None and answer["params"].get("device") == "cuda" and CUDA_FILE.is_file():
-        answer["lacks"] = _import_file(CUDA_FILE).find_missing(stage, resolved)
-    if scene is not None and hasattr(planned, "scene_files"):
-        files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
-        answer["reads"] = sorted(str(path) for path in files)
-    if scene is not None and hasattr(planned, "scene_facts"):
+        answer["unavailable"] = planned.unavailable(params)
+    if "brings" in question:
+        answer |= _describe_lacks(planned, params, stage, frozenset(question["brings"]))
+    if "scene" in question:
+        answer |= _describe_scene(planned, params, Path(question["scene"]))
+    if "needs" in question and hasattr(planned, "preview"):
+        needs = {name: path and Path(path) for name, path in question["needs"].items()}
         try:
-            answer["facts"] = planned.scene_facts(resolved, Path(scene))
-        except ValueError:  # the stage's preview reports this error
-            answer["facts"] = {}
-    if needs is not None and hasattr(planned, "preview"):
-        try:
-            answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
+            answer["notes"] = list(planned.preview(params, **needs))
         except ValueError as error:
             answer["refusal"] = format_error(error)
         except Exception as error:
             answer["notes"] = [f"(its preview failed: {format_error(error)})"]
+    return answer
+
+
+def _describe_lacks(planned: Any, params: Any, stage: str, brings: frozenset[str]) -> dict[str, Any]:
+    """Return the weights that a stage needs and could use, and what this machine lacks for CUDA."""
+    answer = {}
+    if hasattr(planned, "needed_weights"):
+        answer["needed"] = [asdict(need) for need in planned.needed_weights(params, brings)]
+    if hasattr(planned, "optional_weights"):
+        answer["optional"] = [asdict(need) for need in planned.optional_weights(params)]
+    if getattr(params, "device", "cpu") == "cuda" and CUDA_FILE.is_file():
+        answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, params)
+    return answer
+
+
+def _describe_scene(planned: Any, params: Any, scene: Path) -> dict[str, Any]:
+    """Return which files of the scene a stage reads, and which facts about it the stage depends on."""
+    answer: dict[str, Any] = {}
+    if hasattr(planned, "scene_files"):
+        answer["reads"] = sorted(map(str, planned.scene_files(params, scene, list(list_files(scene)))))
+    if hasattr(planned, "scene_facts"):
+        with suppress(ValueError):  # the stage's preview reports this error
+            answer["facts"] = planned.scene_facts(params, scene)
     return answer
 
 
@@ -165,45 +175,13 @@ def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
     return [str(part) for part in (loc[:1] + loc[2:] if tried else loc)]
 
 
-def fetch() -> int:
-    """Download the missing weights that stages need or could use, each once.
-
-    Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
-
-    Returns:
-        Number of failed downloads of weights that stages need. Errors are printed to the standard error; for weights
-        that stages only could use they are warnings.
-    """
-    downloads, optional = {}, set()
-    for stage, question in json.load(sys.stdin).items():
-        planned = _import_file(_description_file(stage))
-        params, needs = planned.Params(**question["params"]), []
-        if hasattr(planned, "needed_weights"):
-            needs += planned.needed_weights(params, frozenset(question["brings"]))
-        if hasattr(planned, "optional_weights"):
-            more = planned.optional_weights(params)
-            optional |= {need.name for need in more} - {need.name for need in needs}
-            needs += more
-        downloads |= {need.name: need for need in needs if need.problem and need.fetched}
-    failed = 0
-    for need in downloads.values():
-        try:
-            need.fetch()
-            print(f"{need.name}: fetched", flush=True)
-        except ValueError as error:
-            failed += need.name not in optional
-            words = ("warning", "; the job runs without it") if need.name in optional else ("error", "")
-            print(f"{words[0]}: {format_error(error)}{words[1]}", file=sys.stderr, flush=True)
-    return failed
-
-
 def frames() -> int:
     """Extract the frames of a video. Prints a sentence about the result or the error, and returns the exit code.
 
     Reads a JSON object: {"video": path, "folder": path of the folder to fill, "content": hash of the video}.
     """
     question = json.load(sys.stdin)
-    video = importlib.import_module("reffusion.capture.layouts.video")
+    video = importlib.import_module("reffusion.capture.video_frames")
     try:
         print(video.extract_frames(Path(question["video"]), Path(question["folder"]), question["content"]))
     except ValueError as error:
@@ -269,7 +247,7 @@ def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
     """Run a stage in this process and return its answer, see `run`; the traceback of an error is written to `log`."""
     started = time.perf_counter()
     try:
-        params = _import_file(_description_file(job["stage"])).Params(**job["params"])
+        params = import_file(description_file(job["stage"])).Params(**job["params"])
         stage = importlib.import_module(f"stages.{job['stage']}")
         needs = {name: path and Path(path) for name, path in job["needs"].items()}
         stage.run(params, Path(job["out"]), **needs)
@@ -297,7 +275,7 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    code = {"describe": describe, "fetch": fetch, "frames": frames, "run": run}[sys.argv[1]]()
+    code = {"describe": describe, "frames": frames, "run": run}[sys.argv[1]]()
     if sys.argv[1] == "run":
         # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()

@@ -16,7 +16,7 @@ import numpy as np
 from reffusion.background.model import Background
 from reffusion.depth import monocular
 from reffusion.initialize.draft import Draft
-from reffusion.initialize.draft_steps import add_random, refit_draft, restrict_invent_masks
+from reffusion.initialize.draft_operations import add_random, refit_draft, restrict_invent_masks
 from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
 from reffusion.initialize.fill import fill_references
 from reffusion.initialize.origins import ORIGINS, OriginMap, find_origins

@@ -34,7 +34,7 @@ from reffusion.io.scene import (
     load_warnings,
     save_mask_sets,
 )  # fmt: skip
-from reffusion.masks import consolidation, frame_check, voting
+from reffusion.masks import consolidation, provided_gaussians, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.remnants import Remnant, find_remnants
@@ -312,5 +312,5 @@ def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera
         return
     some = train[:: max(1, len(train) // CHECKED_VIEWS)]
     photos = exposure.load_normalized_views(poses, fit, [camera.name for camera in some])
-    if problem := frame_check.explain_misplacement(gaussians, some, photos):
+    if problem := provided_gaussians.explain_misplacement(gaussians, some, photos):
         raise ValueError(f"{poses / 'gaussians.ply'}: `gaussians` of scene.yaml: {problem}")

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import frame, image_detail, sfm, stereo
+from reffusion.capture import cameras_around_hole, flow, image_detail, normalized_frame, sfm
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.agreement import judge_poses
 from reffusion.capture.checks.pose_check import check_poses, judge
-from reffusion.capture.layouts import cameras, ring
+from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undistortion_map
 from reffusion.capture.lenses import save_lenses
@@ -104,17 +104,17 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     for name in roles.camera_only:
         lenses[name], pinholes[name] = resized_lens(name, capture, longest)
     assert capture.poses is not None
-    normalized = frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
+    normalized = normalized_frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalized, contradictions = _drop_outliers(params, roles, replace(normalized, camera_only=roles.camera_only), out)
     views = [name for name in views if name in normalized.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     _save_warnings(out, [*messages, *contradictions, *_oddities(normalized, out)])
     if len(normalized.points) < LEAST_POINTS:
-        ranges = frame.view_depth_ranges(capture.poses, pinholes) * normalized.similarity.scale
+        ranges = normalized_frame.view_depth_ranges(capture.poses, pinholes) * normalized.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
         shown = replace(normalized, cameras={name: normalized.cameras[name] for name in views})
-        filled = frame.add_random_points(
+        filled = normalized_frame.add_random_points(
             shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v]
         )
         normalized = replace(filled, cameras=normalized.cameras)
@@ -242,7 +242,7 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
     hole = own_splats.edit.deleted & ~own_splats.edit.scattered
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
     # The cameras are those in the scene's folder; without any, some are placed around the hole.
-    poses, source = found or (ring.place_cameras(means, sizes, opaque, hole, params.longest), None)
+    poses, source = found or (cameras_around_hole.place_cameras(means, sizes, opaque, hole, params.longest), None)
     # The sparse points are a random sample of opaque Gaussians.
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
@@ -251,7 +251,7 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
     poses = replace(poses, points=means[some], colors=colors)
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
     pinholes = {name: undistortion_map(lens)[0] for name, lens in at.items()}
-    placed = frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
+    placed = normalized_frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
     save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
     where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
     _save_warnings(out, [
@@ -337,7 +337,7 @@ def _add_flow_points(scene: Scene, out: Path) -> Scene:
     pixels = sum(camera.width * camera.height for camera in cameras)
     # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.
     cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))
-    points, colors = stereo.triangulate_points(cameras, load_views(out, scene.train), cell)
+    points, colors = flow.triangulate_points(cameras, load_views(out, scene.train), cell)
     kept = np.arange(len(points))
     if len(points) > MORE_POINTS:
         draws = seeding.generator(SEED, "poses", "flow points")

@@ -17,10 +17,10 @@ from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 
 from report import batch as page
 from runner import Refused
-from runner.compare import batch, compare
-from runner.engine import LocalEngine, make_engine
 from runner.execute import Execution, run_scene
-from runner.progress import Progress
+from runner.fleet.compare import batch, compare
+from runner.fleet.engine import LocalEngine, make_engine
+from runner.fleet.progress import Progress
 from runner.resolve import Request
 
 pytestmark = pytest.mark.integration

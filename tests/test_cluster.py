@@ -18,10 +18,12 @@ from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 from test_batch import read_spans, write_projects
 from test_runner_faults import assert_artifacts_complete
 
-from runner.compare import compare
-from runner.engine import LocalEngine, Resources, StageResult, Task, make_engine
+from runner.artifacts import take_over
 from runner.execute import Execution, run_scene
-from runner.retry import run_attempt, take_over
+from runner.fleet.compare import compare
+from runner.fleet.engine import LocalEngine, make_engine
+from runner.fleet.retry import run_attempt
+from runner.process import Resources, StageResult, Task
 from runner.worker import INTERRUPTED
 
 pytestmark = pytest.mark.integration
@@ -96,7 +98,7 @@ def test_an_attempt_given_up_as_lost_writes_nothing(tmp_path, monkeypatch):
             (mine / "trace.jsonl").write_text("late")
         return StageResult({}, 0)
 
-    monkeypatch.setattr("runner.retry.run_process", work)
+    monkeypatch.setattr("runner.fleet.retry.run_process", work)
     run_attempt(make_task(root))
     assert [path.name for path in out.iterdir()] == ["theirs.txt"]
 
@@ -196,7 +198,7 @@ DRIVER = """
 import sys
 from test_cluster import *
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from runner.compare import batch
+from runner.fleet.compare import batch
 root = Path(sys.argv[1])
 engine = make_engine("ray", sys.argv[2], root, root / "runs")
 sys.exit(batch(make_request(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))

@@ -26,7 +26,7 @@ from report import before_after, charts, compare_pictures, job, job_data, result
 from report import compare as page
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
-from runner.compare import compare
+from runner.fleet.compare import compare
 
 pytestmark = pytest.mark.integration
 
@@ -178,11 +178,13 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
     """Runs the command of `make data=FOLDER compare` at tiny sizes, kills it in the second scene, and runs it again."""
-    from reffusion.capture.layouts import spinnerf
+    from reffusion.capture import spinnerf_scenes
 
     for seed, name in enumerate(("1", "2", "book")):
         generate.generate(tmp_path / "data" / name, seed, generate.KINDS["mini"])
-    assert sum("8 training and 3 test views" in line for line in spinnerf.summarize_scenes(tmp_path / "data")) == 3
+    assert (
+        sum("8 training and 3 test views" in line for line in spinnerf_scenes.summarize_scenes(tmp_path / "data")) == 3
+    )
     small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
     command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
     command += [

@@ -339,13 +339,11 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
 
 
 def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
-    from reffusion.capture import stereo
+    from reffusion.capture import flow
 
     write_arc_poses(tmp_path / "poses")
-    seen, find = [], stereo.triangulate_points
-    monkeypatch.setattr(
-        stereo, "triangulate_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest)
-    )
+    seen, find = [], flow.triangulate_points
+    monkeypatch.setattr(flow, "triangulate_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest))
     values = {"iterations": 3, "densify.cap_max": 500, "sh.degree": 0, "init.flow_cell": 2, "holdout": 4}
     params = stage.Params(antialiased=True).changed(values)
     (tmp_path / "out").mkdir()

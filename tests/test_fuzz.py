@@ -33,7 +33,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.given_masks import load_given_mask
 from reffusion.io.images import image_size, load_alpha, load_exr, load_image, load_mask, save_exr
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
-from reffusion.io.quantized import save_splat
+from reffusion.io.splat_format import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.types import Gaussians
 from runner import Refused

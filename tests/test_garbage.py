@@ -13,11 +13,11 @@ import pytest
 from scenes.toy_projects import make_request, write_files, write_project
 
 from runner import Refused
-from runner.compare import compare
 from runner.execute import run_scene
-from runner.garbage import collect_garbage
+from runner.fleet.compare import compare
+from runner.fleet.garbage import collect_garbage
+from runner.fleet.maintenance import clean, verify
 from runner.keys import HASHES, Hashes
-from runner.maintenance import clean, verify
 
 pytestmark = pytest.mark.integration
 

@@ -31,8 +31,8 @@ DOORS = {
     "huggingface_hub": ("reffusion/weights/download.py",),
     "onnxruntime": ("reffusion/onnx.py",),
     "gsply": ("reffusion/io/compressed.py",),
-    "ray": ("runner/ray_engine.py",),
-    "submitit": ("runner/slurm_engine.py",),
+    "ray": ("runner/fleet/ray_engine.py",),
+    "submitit": ("runner/fleet/slurm_engine.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/capture/", "reffusion/trace.py")
@@ -117,6 +117,12 @@ def test_runner_knows_nothing_of_3d(path):
         "reffusion.command.scene_path",
         "reffusion.command.workplace",
     }
+
+
+def test_only_the_command_line_knows_the_fleet():
+    """What plans and runs one scene on one machine imports nothing of runner/fleet/."""
+    core = [path for path in sources("runner") if path.parent.name == "runner" and path.stem != "__main__"]
+    assert not [path for path in core if any(name.startswith("runner.fleet") for name in imports(path))]
 
 
 @pytest.mark.parametrize("path", sources("stages"), ids=relative_path)

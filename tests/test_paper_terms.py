@@ -30,7 +30,7 @@ from reffusion.fit import step
 from reffusion.fit.preparation import limit_sh_degree
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent, project, sample_nearest, unproject
-from reffusion.initialize import draft_steps
+from reffusion.initialize import draft_operations
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.fill import fill_reference
 from reffusion.io.arrays import load_labels
@@ -96,13 +96,13 @@ def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(load_v
 
 def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypatch):
     found = {}
-    monkeypatch.setattr(draft_steps, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
+    monkeypatch.setattr(draft_operations, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
     masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     background = Background([type("View", (), {"camera": wall_camera(), "masked": masked})], {})
     scene = type("Scene", (), {"clean": (), "camera_only": ()})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
     draft = Draft(None, torch.zeros(0, dtype=torch.uint8))
-    draft_steps.refit_draft(draft, 1, scene, background, [], sets, True, tmp_path)
+    draft_operations.refit_draft(draft, 1, scene, background, [], sets, True, tmp_path)
     assert (found["a"] == masked | invent).all()
 
 

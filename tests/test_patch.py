@@ -17,7 +17,7 @@ from scenes.capture import make_truth
 from scenes.edited_capture import EDITOR, FIELDS, plane_with_ball, remove_pictures, write_edited_capture
 from scenes.stage_runs import run_masks
 
-from reffusion.capture.layouts import ring
+from reffusion.capture import cameras_around_hole
 from reffusion.fit import exposure
 from reffusion.gaussians import matching
 from reffusion.gaussians.movement import Cloud
@@ -226,7 +226,7 @@ def test_a_walled_in_hole_is_in_sight_from_nowhere():
     means = np.concatenate([hole, shell])
     deleted = np.arange(len(means)) < len(hole)
     with pytest.raises(ValueError, match=r"bring cameras"):
-        ring.place_cameras(means, np.full(len(means), 0.05), np.ones(len(means), bool), deleted, 64)
+        cameras_around_hole.place_cameras(means, np.full(len(means), 0.05), np.ones(len(means), bool), deleted, 64)
 
 
 # ---------------------------------------------------------------------------------------------- the stage `masks`

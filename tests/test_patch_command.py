@@ -18,7 +18,7 @@ from scenes.processes import run_module
 from scenes.random_scene import random_gaussians
 from test_patch import match_points
 
-from reffusion.capture.layouts import ring
+from reffusion.capture import cameras_around_hole
 from reffusion.io.arrays import load_labels
 from reffusion.io.files import BadInput
 from reffusion.io.ply import check_can_save, load_ply, load_property_names, save_ply, save_splats
@@ -218,7 +218,7 @@ def sample_room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("walls", [(), ("back",), ("back", "left")])
 def test_cameras_of_an_open_room_stand_in_it(walls):
     means, deleted = sample_room(*walls)
-    found = ring.place_cameras(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
+    found = cameras_around_hole.place_cameras(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
     assert len(found.lenses) >= 3
     for pose in found.world_to_camera.values():
         place = -pose[:3, :3].T @ pose[:3, 3]

@@ -36,8 +36,7 @@ from scenes.capture import (
     write_spin_nerf,
 )
 
-from reffusion.capture import frame, lens
-from reffusion.capture.layouts import spinnerf
+from reffusion.capture import lens, normalized_frame, spinnerf_scenes
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
@@ -233,7 +232,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     (tmp_path / "3/poses_bounds.npy").unlink()
     (tmp_path / "book/poses_bounds.npy").unlink()
     (tmp_path / "notes").mkdir()
-    lines = dict(line.split(": ", 1) for line in spinnerf.summarize_scenes(tmp_path))
+    lines = dict(line.split(": ", 1) for line in spinnerf_scenes.summarize_scenes(tmp_path))
     assert lines["1"] == "4 training and 2 test views (published: 60 and 40); images_4 96x72, images 384x288 px"
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
@@ -241,7 +240,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     run_stages(tmp_path / "book", longest=4 * WIDTH)  # the COLMAP model replaces poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
-        spinnerf.summarize_scenes(tmp_path / "notes")
+        spinnerf_scenes.summarize_scenes(tmp_path / "notes")
 
 
 def test_splits_from_scene_yaml(tmp_path):
@@ -358,10 +357,10 @@ def test_depth_has_a_fallback_without_points():
     poses_along[:, 0, 3] = np.arange(4.0)
     pinholes = [lens.Lens(10, 10, 10.0, 10.0, 5.0, 5.0)] * 4
     nothing = np.zeros((0, 3))
-    ranges = frame.depth_ranges(poses_along, pinholes, nothing, None)
+    ranges = normalized_frame.depth_ranges(poses_along, pinholes, nothing, None)
     assert (ranges > 0).all() and np.allclose(ranges[:, 1], 3 * np.std(np.arange(4.0)))
     with pytest.raises(ValueError, match="nothing tells"):
-        frame.depth_ranges(np.stack([np.eye(4)] * 4), pinholes, nothing, None)
+        normalized_frame.depth_ranges(np.stack([np.eye(4)] * 4), pinholes, nothing, None)
 
 
 def test_random_points_are_seen_seeded_and_colored(tmp_path, monkeypatch):

@@ -49,8 +49,8 @@ from reffusion.references.files import ReferenceFile
 from reffusion.references.undistort import undistort_reference, undistort_reference_depth
 from reffusion.types import Reference
 from runner.execute import run_scene
+from runner.fleet.maintenance import clean
 from runner.keys import Hashes, code_fingerprints
-from runner.maintenance import clean
 from runner.plan import plan
 from runner.resolve import Request
 from runner.resolve import resolve as prepare_job

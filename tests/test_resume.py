@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from scenes.processes import start_module
 
-from runner import maintenance
 from runner.files import RECEIPT, list_files, read_json
+from runner.fleet import maintenance
 from runner.keys import Hashes
 from runner.plan import decide
 from runner.resolve import Request, resolve

@@ -17,9 +17,10 @@ import pytest
 from scenes.processes import start_module, wait_until
 from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 
-from runner import Failed, Refused, compare, maintenance, process, results
+from runner import Failed, Refused, process, results
 from runner.durations import expected_seconds, typical_seconds
 from runner.execute import run_scene
+from runner.fleet import compare, maintenance
 from runner.keys import Hashes, code_fingerprints, fingerprint
 from runner.plan import plan
 from runner.plan_table import plan_table
@@ -636,7 +637,7 @@ class Need:
 
 
 def test_missing_weights_are_reported_before_any_work_and_fetched(empty_project, capsys):
-    from runner.weights import fetch_weights
+    from runner.fleet.weights import fetch_weights
 
     source = empty_project / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)

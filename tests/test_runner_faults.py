@@ -26,10 +26,11 @@ from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 from test_runner import REPO, finished_project, project, read_score, run_project, start_runner, statuses
 
 from reffusion import trace
-from runner import Refused, compare, maintenance
+from runner import Refused
 from runner.artifacts import diff_artifact
 from runner.execute import run_scene
 from runner.files import RECEIPT
+from runner.fleet import compare, maintenance
 from runner.keys import Hashes
 from runner.plan import decide
 from runner.plan_table import plan_table

@@ -26,7 +26,7 @@ from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.files import BadInput
 from reffusion.io.ply import load_ply, load_points, save_ply, save_splats
 from reffusion.io.ply_table import load_header
-from reffusion.io.quantized import save_splat
+from reffusion.io.splat_format import save_splat
 from reffusion.io.splat_transform import PACKAGE, save_for_web
 from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.types import Gaussians, Similarity

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from reffusion import command
-from reffusion.capture import sfm
-from reffusion.capture.layouts import video
+from reffusion.capture import sfm, video_frames
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
 from report import cli
 from runner import Refused
+from runner.fleet.maintenance import clean
 from runner.frames import update_frames
-from runner.maintenance import clean
 from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -68,19 +67,19 @@ def walk_video(tmp_path):
 
 
 def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, tmp_path):
-    message = video.extract_frames(walk_video, tmp_path / "a", "hash")
+    message = video_frames.extract_frames(walk_video, tmp_path / "a", "hash")
     numbers = [int(path.stem.removeprefix("frame_")) for path in sorted((tmp_path / "a/images").iterdir())]
     assert all(number % 4 in (1, 2) for number in numbers), "none is blurred or smeared"
     way = STEP * SHOTS / WIDTH  # path of the camera in picture widths
-    assert len(numbers) == pytest.approx(way / video.SPACING, rel=0.3)
+    assert len(numbers) == pytest.approx(way / video_frames.SPACING, rel=0.3)
     apart = np.diff([number // 4 for number in numbers]) * STEP / WIDTH
-    assert apart.min() > 0 and apart.max() <= 2.5 * video.SPACING
+    assert apart.min() > 0 and apart.max() <= 2.5 * video_frames.SPACING
     facts = json.loads((tmp_path / "a/frames.json").read_text())
     assert facts["taken"] == len(numbers) and facts["said"] == message and facts["size"] == [WIDTH, HEIGHT]
     with open(tmp_path / "a/frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 4 * SHOTS and [int(r["frame"]) for r in rows if r["what"] == video.TAKEN] == numbers
-    video.extract_frames(walk_video, tmp_path / "b", "hash")
+    assert len(rows) == 4 * SHOTS and [int(r["frame"]) for r in rows if r["what"] == video_frames.TAKEN] == numbers
+    video_frames.extract_frames(walk_video, tmp_path / "b", "hash")
     for path in (tmp_path / "a/images").iterdir():
         assert path.read_bytes() == (tmp_path / "b/images" / path.name).read_bytes()
 
@@ -88,7 +87,7 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, t
 def test_where_the_camera_stands_nothing_is_taken_twice(tmp_path):
     still = render_walk()
     stands = write_video(tmp_path / "stands.mp4", [*still[:30], *[still[30]] * 90, *still[30:]])
-    video.extract_frames(stands, tmp_path / "out", "")
+    video_frames.extract_frames(stands, tmp_path / "out", "")
     numbers = [int(path.stem.removeprefix("frame_")) for path in (tmp_path / "out/images").iterdir()]
     assert sum(30 <= number < 120 for number in numbers) <= 2
 
@@ -99,7 +98,7 @@ def test_a_film_that_was_held_upright_stands_upright(walk_video, tmp_path):
     data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, HEIGHT << 16, 0, 1 << 30)
     turned = walk_video.with_name("turned.mp4")
     turned.write_bytes(data)
-    read = lambda path: next(frame for _, _, frame in video._frames(path, lambda number: number == 9))
+    read = lambda path: next(frame for _, _, frame in video_frames._frames(path, lambda number: number == 9))
     assert np.array_equal(read(turned), np.rot90(read(walk_video), -1))
 
 
@@ -117,7 +116,7 @@ def test_a_film_that_was_held_upright_stands_upright(walk_video, tmp_path):
 def test_videos_without_enough_views_are_refused(tmp_path, made, message):
     made(tmp_path / "x.mp4")
     with pytest.raises(BadInput, match=message):
-        video.extract_frames(tmp_path / "x.mp4", tmp_path / "out", "")
+        video_frames.extract_frames(tmp_path / "x.mp4", tmp_path / "out", "")
     assert not (tmp_path / "out/images").exists() and not (tmp_path / "out/frames.json").exists()
 
 
@@ -134,7 +133,7 @@ def test_videos_without_enough_views_are_refused(tmp_path, made, message):
 def test_other_files_in_place_of_a_scene(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"")
     with pytest.raises(BadInput, match=message):
-        video.extract_frames(tmp_path / name, tmp_path / "out", "")
+        video_frames.extract_frames(tmp_path / name, tmp_path / "out", "")
 
 
 @pytest.mark.integration

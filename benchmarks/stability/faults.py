@@ -99,7 +99,7 @@ FAULTS = (
           lambda right: lambda disparity, weights: np.zeros_like(disparity), "completion, hole over three borders"),
     Fault("a missing epsilon where no confidence reaches", "reffusion.depth.bilateral", "UNREACHED", lambda right: 0.0,
           "solver, two known pixels"),
-    Fault("an offset that is added, not taken off", "reffusion.capture.frame", "normalize_pose",
+    Fault("an offset that is added, not taken off", "reffusion.capture.normalized_frame", "normalize_pose",
           lambda right: lambda pose, similarity: right(pose, replace(similarity, offset=-similarity.offset)),
           "offset 1e6 of the extent, normalised"),
     Fault("positions of an export in float32 always", "reffusion.io.ply", "save_vertices",

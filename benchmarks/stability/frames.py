@@ -18,7 +18,7 @@ from plyfile import PlyData
 
 from benchmarks.stability.cases import EPS32, EPS64, Case, nan_safe_max
 from reffusion import seeding
-from reffusion.capture import frame
+from reffusion.capture import normalized_frame
 from reffusion.capture.lens import Lens
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
@@ -73,10 +73,12 @@ def normalized_scene(extent: float, offset: float) -> Scene:
     world, lens = poses(extent, place), Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
     points = extent * true_gaussians().means.double().numpy() + place
     matrices = np.stack(list(world.values()))
-    ranges = frame.depth_ranges(matrices, [lens] * VIEWS, points, None)
-    similarity = frame.normalizing_similarity(matrices, ranges[:, 1])
+    ranges = normalized_frame.depth_ranges(matrices, [lens] * VIEWS, points, None)
+    similarity = normalized_frame.normalizing_similarity(matrices, ranges[:, 1])
     cameras = {
-        name: Camera(name, WIDTH, HEIGHT, lens.fx, lens.fy, lens.cx, lens.cy, frame.normalize_pose(pose, similarity))
+        name: Camera(
+            name, WIDTH, HEIGHT, lens.fx, lens.fy, lens.cx, lens.cy, normalized_frame.normalize_pose(pose, similarity)
+        )
         for name, pose in world.items()
     }
     colors = np.full((len(points), 3), 128, np.uint8)
@@ -187,7 +189,7 @@ def refuse_one_place() -> float:
     """
     lens = Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
     try:
-        frame.depth_ranges(np.stack([np.eye(4)] * 3), [lens] * 3, np.zeros((0, 3)), None)
+        normalized_frame.depth_ranges(np.stack([np.eye(4)] * 3), [lens] * 3, np.zeros((0, 3)), None)
     except ValueError as refusal:
         return float("nothing tells" not in str(refusal))
     return 1.0

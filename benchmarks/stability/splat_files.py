@@ -19,7 +19,7 @@ from benchmarks.stability.cases import EPS32, EPS64, EXACT, Case, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.ply import save_ply
-from reffusion.io.quantized import open_splat, save_splat
+from reffusion.io.splat_format import open_splat, save_splat
 from reffusion.io.splat_rows import FLAT, MOST_LOGIT, Rows, drop_invalid, fold_filter
 from reffusion.io.splats import load_splats
 from reffusion.splat import rasterizer

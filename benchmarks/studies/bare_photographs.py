@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reffusion.capture.frame import camera_centers
 from reffusion.capture.load import load_capture
+from reffusion.capture.normalized_frame import camera_centers
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_scene
 from stages import poses

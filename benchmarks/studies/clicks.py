@@ -24,7 +24,7 @@ from reffusion.clicks.events import Event
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.propagation import iou
+from reffusion.clicks.propagation_with_network import iou
 from reffusion.clicks.scene_masks import evidence_loader
 from reffusion.clicks.scene_segmentation import segment_scene
 from reffusion.clicks.segmenter import Segmenter

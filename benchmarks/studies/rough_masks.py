@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.studies import compositing
 from benchmarks.studies.composites import ROOT, make_scenes, select_places
 from reffusion import seeding
-from reffusion.clicks.propagation import iou
+from reffusion.clicks.propagation_with_network import iou
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_scene

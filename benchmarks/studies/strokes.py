@@ -23,7 +23,7 @@ from reffusion.clicks.events import Event
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.propagation import count_all_votes, iou
+from reffusion.clicks.propagation_with_network import count_all_votes, iou
 from reffusion.clicks.scene_masks import evidence_loader
 from reffusion.clicks.scene_segmentation import correct_scene
 from reffusion.io.images import save_image

@@ -11,7 +11,7 @@ from math import isqrt
 import numpy as np
 
 from reffusion import geometry
-from reffusion.capture.frame import nearest_depths
+from reffusion.capture.normalized_frame import nearest_depths
 from reffusion.types import Camera
 
 CELLS = 40  # cells along a view's width; the nearest point of a cell hides the points behind it

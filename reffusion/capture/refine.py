@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reffusion.capture import stereo
+from reffusion.capture import flow
 from reffusion.capture.sfm import bundle_adjust
 from reffusion.types import Camera
 
@@ -74,10 +74,10 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
     cell = max(4, round((sum(c.width * c.height for c in cameras) / (2 * TRACKS)) ** 0.5))
     probe = cameras[:: -(-len(cameras) // PROBE_VIEWS)]
     coarse = max(LEAST_CELL, round(max(max(camera.width, camera.height) for camera in cameras) / PROBE_CELLS))
-    before = flow_residual(list(stereo.match_views(probe, cameras, images, coarse)), initial, coarse)
+    before = flow_residual(list(flow.match_views(probe, cameras, images, coarse)), initial, coarse)
     if not before > GOOD_RESIDUAL:
         return Refinement(initial, before, None)
-    matches = list(stereo.match_views(cameras, cameras, images, cell))
+    matches = list(flow.match_views(cameras, cameras, images, cell))
     odd = [((m.pixels // cell).sum(1) % 2).astype(bool) for m in matches]
     fitting = [_select(m, ~o) for m, o in zip(matches, odd, strict=True)]
     checking = [_select(m, o) for m, o in zip(matches, odd, strict=True)]
@@ -90,7 +90,7 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
     return Refinement(adjusted, before, after) if after < LARGEST_RATIO * before else Refinement(initial, before, None)
 
 
-def _adjust(matches: Sequence[stereo.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
+def _adjust(matches: Sequence[flow.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
     """Return the cameras after `ROUNDS` rounds of `bundle_adjust`."""
     fixed: set[str] = set()
     while True:
@@ -109,7 +109,7 @@ def _shift(camera: Camera, initial: Camera) -> float:
     return float(np.hypot(camera.cx - initial.cx, camera.cy - initial.cy) / max(initial.width, initial.height))
 
 
-def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cell: int) -> float:
+def flow_residual(matches: Sequence[flow.Matches], cameras: Mapping[str, Camera], cell: int) -> float:
     """Return the systematic reprojection error of cameras in pixels; NaN if there are too few matches.
 
     Points are triangulated from the flow. A residual vector leads from the place where flow finds a point in a
@@ -124,9 +124,9 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
     """
     lengths = []
     for match in matches:
-        depth, known = stereo.triangulate(match, cameras)
+        depth, known = flow.triangulate(match, cameras)
         block = (match.pixels // (BLOCK * cell)).astype(int) @ (100_000, 1)
-        for vectors, seen in zip(stereo.flow_residuals(match, cameras, depth), match.seen, strict=True):
+        for vectors, seen in zip(flow.flow_residuals(match, cameras, depth), match.seen, strict=True):
             usable = known & seen & np.isfinite(vectors).all(1)
             for index in np.unique(block[usable]):
                 centers = vectors[usable & (block == index)]
@@ -135,16 +135,16 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
     return float(np.mean(lengths)) if lengths else float("nan")
 
 
-def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):
+def _build_tracks(matches: Sequence[flow.Matches], cameras: Mapping[str, Camera]):
     """Return `sightings` and `points` of `bundle_adjust`: one point per matched pixel that agrees with a neighbor."""
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:
-        depth, known = stereo.triangulate(match, cameras)
-        depth = np.minimum(depth, stereo.FARTHEST)
-        away = np.abs(stereo.flow_residuals(match, cameras, depth)).max(2)
-        agree = match.seen & (away < stereo.RESIDUAL)
-        places = stereo.unproject(cameras[match.view], match.pixels, depth)
+        depth, known = flow.triangulate(match, cameras)
+        depth = np.minimum(depth, flow.FARTHEST)
+        away = np.abs(flow.flow_residuals(match, cameras, depth)).max(2)
+        agree = match.seen & (away < flow.RESIDUAL)
+        places = flow.unproject(cameras[match.view], match.pixels, depth)
         for k in np.flatnonzero(known & agree.any(0)):
             sightings = [(match.view, match.pixels[k])]
             sightings += [(name, match.places[j, k]) for j, name in enumerate(match.others) if agree[j, k]]
@@ -156,7 +156,7 @@ def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
     return seen_at, points
 
 
-def _select(matches: stereo.Matches, chosen: np.ndarray) -> stereo.Matches:
+def _select(matches: flow.Matches, chosen: np.ndarray) -> flow.Matches:
     """Return the matches of the pixels for which `chosen`, bool [P], is True."""
     return replace(
         matches, pixels=matches.pixels[chosen], places=matches.places[:, chosen], seen=matches.seen[:, chosen]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
+from reffusion.capture.mask_files import NONE, find_masks, match_masks
 from reffusion.capture.names import list_pictures
 from reffusion.capture.views import ViewTable, check_proportions, resolve_view
 from reffusion.io.files import BadInput

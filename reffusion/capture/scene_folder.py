@@ -8,9 +8,9 @@ from pathlib import Path
 from reffusion.capture.click_coordinates import check_clicks
 from reffusion.capture.layouts.cameras import has_pictures
 from reffusion.capture.layouts.capture import AS_GIVEN, Capture, Correction
-from reffusion.capture.layouts.mask_files import group_by_object
 from reffusion.capture.lens import undistorted_pinhole
 from reffusion.capture.load import LONGEST, load_capture
+from reffusion.capture.mask_files import group_by_object
 from reffusion.capture.names import list_pictures
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import resolve_view

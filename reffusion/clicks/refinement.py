@@ -10,9 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from reffusion import trace
-from reffusion.clicks import all_views
+from reffusion.clicks import propagation_without_network
 from reffusion.clicks.fitted_views import FittedViews
-from reffusion.clicks.propagation import combine, count_all_votes, draw_mask, project_votes
+from reffusion.clicks.propagation_with_network import combine, count_all_votes, draw_mask, project_votes
 from reffusion.gaussians.neighbors import find_neighbors
 
 ROUGH_RIM = 0.02  # share of the larger image side: pixels this near to a rough mask's border do not vote
@@ -32,8 +32,11 @@ def redraw_masks(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[st
     gaussians, cameras, names = views.gaussians, views.cameras, list(views.cameras)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbors(gaussians)
-    labels = all_views.label_gaussians(gaussians, near, cameras, masks, image_of, ROUGH_RIM)
-    drawn = {name: all_views.object_mask(gaussians, labels, cameras[name], image_of(name)) for name in names}
+    labels = propagation_without_network.label_gaussians(gaussians, near, cameras, masks, image_of, ROUGH_RIM)
+    drawn = {
+        name: propagation_without_network.object_mask(gaussians, labels, cameras[name], image_of(name))
+        for name in names
+    }
     votes = count_all_votes(gaussians, cameras, drawn)
     for k in trace.progress(len(names), "masks drawn anew"):
         projection = project_votes(gaussians, cameras[names[k]], votes)

@@ -10,11 +10,11 @@ import numpy as np
 
 from reffusion.capture.click_coordinates import undistort_clicks
 from reffusion.capture.views import check_outliers
-from reffusion.clicks import all_views
+from reffusion.clicks import propagation_without_network
 from reffusion.clicks.events import Event
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.propagation import count_all_votes, draw_view, project_votes
+from reffusion.clicks.propagation_with_network import count_all_votes, draw_view, project_votes
 from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import segment_scene
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image, predict_masks
@@ -98,7 +98,7 @@ def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np
     for name in scene.test:
         camera, view = scene.cameras[name], views.evidence_of(name)
         mask = draw_view(view, project_votes(views.gaussians, camera, votes))
-        if all_views.is_visible(views.gaussians, camera, view.image, mask):
+        if propagation_without_network.is_visible(views.gaussians, camera, view.image, mask):
             found[name] = mask
     return found
 
@@ -143,7 +143,7 @@ def load_evidence(
         segmenter: the segmentation network; None for none.
         features_of: function that returns the network's features of the photograph.
     """
-    relief = None if gaussians is None else all_views.surface_relief(gaussians, camera)
+    relief = None if gaussians is None else propagation_without_network.surface_relief(gaussians, camera)
     if segmenter is None:
         return ViewEvidence(image, relief)
     return ViewEvidence(image, relief, lambda prompt: predict_masks(segmenter, features_of(), prompt))

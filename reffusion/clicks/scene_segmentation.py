@@ -13,12 +13,12 @@ from functools import partial
 
 import numpy as np
 
-from reffusion.clicks import all_views
+from reffusion.clicks import propagation_without_network
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import FittedViews, transfer_marks
 from reffusion.clicks.marks import OTHER, confirmed_pixels
-from reffusion.clicks.propagation import propagate_masks
+from reffusion.clicks.propagation_with_network import propagate_masks
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbors import find_neighbors
 from reffusion.morphology import dilate
@@ -143,9 +143,9 @@ def propagate(views: FittedViews, masks: Masks, former: Masks | None = None) -> 
         return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views, former)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbors(views.gaussians)
-    labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
+    labels = propagation_without_network.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
     return dict(masks) | {
-        name: all_views.object_mask(views.gaussians, labels, camera, image_of(name))
+        name: propagation_without_network.object_mask(views.gaussians, labels, camera, image_of(name))
         for name, camera in views.cameras.items()
         if name not in masks
     }

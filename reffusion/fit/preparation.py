@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from reffusion import seeding
-from reffusion.capture import image_detail, stereo
+from reffusion.capture import flow, image_detail
 from reffusion.fit import few_views
 from reffusion.fit.exposure import BRIGHTNESS_DEVIATION
 from reffusion.fit.gains import brightness_deviation, estimate_gains
@@ -132,7 +132,7 @@ def collect_points(
 
     points, colors = scene.points, scene.point_colors
     if params.init.flow_cell:
-        flow_points, flow_colors = stereo.triangulate_points(cameras, images, params.init.flow_cell)
+        flow_points, flow_colors = flow.triangulate_points(cameras, images, params.init.flow_cell)
         print(f"{len(flow_points)} points by optical flow beside {len(points)}", flush=True)
         points, colors = np.concatenate([points, flow_points]), np.concatenate([colors, flow_colors])
     kept = ~voting.points_inside(points, cameras, hidden)

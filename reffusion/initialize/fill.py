@@ -12,8 +12,8 @@ from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
 from reffusion.depth import billboard, monocular
 from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
+from reffusion.depth.discontinuities import beside_steps, sharpen_steps
 from reffusion.depth.monocular import DepthNetwork
-from reffusion.depth.steps import beside_steps, sharpen_steps
 from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, unprojection
 from reffusion.initialize.draft import EXTRA_VIEW, REFERENCE, Draft

@@ -14,7 +14,7 @@ from reffusion.io.compressed import MIP_COMMENT, PACKED
 from reffusion.io.files import BadInput, reading
 from reffusion.io.glb import save_glb
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
-from reffusion.io.quantized import save_splat
+from reffusion.io.splat_format import save_splat
 from reffusion.io.splat_rows import Rows
 from reffusion.io.splats import (
     BLOCK,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reffusion.io import compressed, glb, quantized, splat_transform
+from reffusion.io import compressed, glb, splat_format, splat_transform
 from reffusion.io.files import BadInput, is_file, reading
 from reffusion.io.ply_table import load_header, load_vertices
 from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, drop_invalid, fold_filter
@@ -122,7 +122,7 @@ def summarize_splats(path: Path) -> Summary:
         count, antialiased = glb.summarize_glb(path)
         return Summary(count, antialiased=antialiased)
     if ending == ".splat":
-        return Summary(quantized.count_splat(path))
+        return Summary(splat_format.count_splat(path))
     if ending == ".spz":
         compressed.check_gsply(path)
         count, _, antialiased = compressed.load_spz_header(path)
@@ -159,7 +159,7 @@ def load_splats(path: Path) -> Splats:
             return Splats(converted.rows, converted.antialiased or summary.antialiased, converted.notes)
     with reading(path, "a file of Gaussians"):
         if ending == ".splat":
-            read = quantized.open_splat(path)
+            read = splat_format.open_splat(path)
         elif ending == ".glb":
             read = glb.load_glb(path).take
         elif ending == ".spz":

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from reffusion.capture.checks.sparse_points import are_tracks_inside, keep_points_in_frame
 from reffusion.capture.layouts.capture import (
     AS_GIVEN,
     NO_POINTS,
@@ -22,7 +23,6 @@ from reffusion.capture.layouts.capture import (
     relative_paths,
     resize_lens,
 )
-from reffusion.capture.layouts.points import are_tracks_inside, keep_points_in_frame
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
 from reffusion.io.files import BadInput, is_file, reading

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
     AS_GIVEN,
     NO_POINTS,
@@ -30,6 +29,7 @@ from reffusion.capture.layouts.capture import (
 )
 from reffusion.capture.layouts.colmap import capture_from_model, find_model
 from reffusion.capture.lens import Lens
+from reffusion.capture.normalized_frame import depths_in_view
 from reffusion.io.arrays import load_array
 from reffusion.io.colmap import load_cameras, load_model_points, model_file
 from reffusion.io.files import BadInput, is_file

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from reffusion.capture.checks.sparse_points import keep_points_in_frame
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
     Capture,
@@ -20,7 +21,6 @@ from reffusion.capture.layouts.capture import (
     relative_paths,
     resize_lens,
 )
-from reffusion.capture.layouts.points import keep_points_in_frame
 from reffusion.capture.lens import Lens
 from reffusion.capture.names import list_pictures, name_views, pair_pictures
 from reffusion.io.files import BadInput

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from reffusion.capture.checks.sparse_points import keep_points_in_frame
 from reffusion.capture.layouts.capture import (
     AS_GIVEN,
     NO_POINTS,
@@ -28,9 +29,8 @@ from reffusion.capture.layouts.capture import (
     relative_paths,
 )
 from reffusion.capture.layouts.depth_maps import points_from_depth
-from reffusion.capture.layouts.frame_lens import frame_lens, load_frame_lens, read_number
-from reffusion.capture.layouts.points import keep_points_in_frame
 from reffusion.capture.layouts.pose_matrices import read_matrices
+from reffusion.capture.layouts.transforms_lens import frame_lens, load_frame_lens, read_number
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput, is_file, shorten

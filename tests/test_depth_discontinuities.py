@@ -7,7 +7,7 @@ from scenes import wall_scene
 from scenes.cameras import make_camera
 
 from reffusion import geometry
-from reffusion.depth.steps import beside_steps, sharpen_steps
+from reffusion.depth.discontinuities import beside_steps, sharpen_steps
 from reffusion.gaussians.surfels import surface_normals
 
 SHAPE = (120, 160)

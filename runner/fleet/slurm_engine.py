@@ -16,8 +16,8 @@ from typing import Any
 import submitit
 
 from runner import Failed, Refused
-from runner.engine import GRACE, Resources, StageResult, Task
-from runner.retry import run_attempt
+from runner.fleet.retry import run_attempt
+from runner.process import GRACE, Resources, StageResult, Task
 from runner.text import display_path, format_error
 
 RETRIES = 3  # number of times that a stage is submitted again after its node was lost

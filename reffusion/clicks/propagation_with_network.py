@@ -23,13 +23,13 @@ import torch
 from scipy import ndimage
 
 from reffusion import trace
-from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
 from reffusion.clicks.pixel_grid import DEPTH_SLOPE
+from reffusion.clicks.propagation_without_network import remove_rim
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence
-from reffusion.clicks.supports import find_support_gaussians
+from reffusion.clicks.support_planes import find_support_gaussians
 from reffusion.morphology import open_mask
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -220,7 +220,7 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray, voting: 
 
 
 def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
-    """Add votes against the object for Gaussians without a label on planes beside the object (see `supports`)."""
+    """Add votes against the object for Gaussians without a label on planes beside the object (see `support_planes`)."""
     known, share = votes.has_label, votes.shares
     means = gaussians.means.detach().double().cpu().numpy()
     assumed = find_support_gaussians(means, share > 0.5, known & (share < MAX_OTHER_SHARE)) & ~known

@@ -13,11 +13,11 @@ from typing import Any
 
 from reffusion.command import scene_name
 from runner import Refused, say
-from runner.engine import LocalEngine
 from runner.execute import Execution
 from runner.files import write_json
+from runner.fleet.engine import LocalEngine
+from runner.fleet.parallel import Outcome, SceneRun, run_all
 from runner.keys import HASHES, Hashes
-from runner.parallel import Outcome, SceneRun, run_all
 from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown_name
 from runner.resolve import Request, resolve_all
 from runner.results import mean_scores, write_table

@@ -1,78 +1,32 @@
-"""Engines, which run the processes of stages with given cores, memory and GPUs.
+"""Engines for many scenes, which run the processes of stages with given cores, memory and GPUs.
 
-The engine of this module uses this machine; those of ray_engine.py and slurm_engine.py use clusters.
+The engine of this module shares this machine among scenes; those of ray_engine.py and slurm_engine.py use clusters.
 """
 
 import importlib
-import json
 import os
 import signal
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from runner import Refused, say
-from runner.process import start_worker
+from runner import Refused, process, say
+from runner.durations import earlier_receipts
+from runner.files import list_files
+from runner.process import Resources, StageResult, Task, run_process
+from runner.resolve import ResolvedJob
 
 ALL_MEMORY_MB = 2**40  # more than any machine has, so that the stage runs alone
-GRACE = 20.0  # seconds after which an interrupted stage that has not ended is killed
 # (limit, usage) of the memory of this process's control group, in versions 2 and 1 of cgroups
 CGROUPS = (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
            ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"))  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Resources:
-    """The resources of one stage.
-
-    Attributes:
-        cores: number of CPU cores. None for all cores of this machine, or for one core on a cluster.
-        gpus: number of GPUs.
-        memory_mb: CPU memory to reserve, MB.
-    """
-
-    cores: int | None
-    gpus: int
-    memory_mb: int
-
-
-@dataclass(frozen=True)
-class Task:
-    """The work of one stage.
-
-    Attributes:
-        root: folder with pipeline.yaml and stages/.
-        line: the job description that `worker.run` reads; paths are text. `run_process` adds "result" and "lock", and
-            an engine adds the cores and GPUs.
-        output: the file to which everything that the stage prints is appended; None for the runner's own output.
-    """
-
-    root: Path
-    line: dict[str, Any]
-    output: Path | None = None
-
-
-@dataclass(frozen=True)
-class StageResult:
-    """The result of a stage's process.
-
-    Attributes:
-        answer: the answer of the process, see `worker.run`; empty if it gave none.
-        code: exit code; the negative number of a signal that ended the process.
-        interrupted: True if the runner was interrupted (Ctrl-C) while it waited for the process.
-    """
-
-    answer: dict[str, Any]
-    code: int
-    interrupted: bool = False
-
-
-class Engine(Protocol):
-    """The interface of an engine: a place where stages run.
+class Engine(process.Engine, Protocol):
+    """The interface of an engine that several threads may use at a time.
 
     Attributes:
         cuda: whether its machines have a GPU; None if it is this machine, see `resolve.has_cuda`.
@@ -85,24 +39,6 @@ class Engine(Protocol):
     cores: int
     gpus: int
     is_remote: bool
-
-    def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
-        """Wait for the resources, run a task in a process, and wait for its end.
-
-        A failure of the stage is no exception; it is in the result. A process that is lost may be started again.
-
-        Args:
-            task: the work.
-            resources: the resources that the process gets.
-            lock: open file descriptor of the lock of the scene's folder in runs/. A local process keeps it open, so
-                that the lock is held until the process ends.
-            on_start: called when the task has its resources, or on a cluster when it is submitted. If the task is
-                started again, it may be called again.
-
-        Raises:
-            KeyboardInterrupt: the engine was stopped before the task succeeded.
-        """
-        ...
 
     def stop(self) -> None:
         """Interrupt the running tasks, and start no further ones. Does not wait for their end.
@@ -136,7 +72,6 @@ class LocalEngine:
         self.memory_mb = memory_mb if memory_mb is not None else free_memory_mb()
         self._asks_system = memory_mb is None
         self._reserved: dict[int, int] = {}  # running task -> its memory, MB
-        self._running: set[subprocess.Popen[str]] = set()
         self._change, self._stopped, self._number = threading.Condition(), False, 0
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
@@ -157,7 +92,7 @@ class LocalEngine:
             on_start()
             where = {"cores": len(cores), "on": cores} if resources.cores is not None else {}
             where |= {"gpus": ",".join(gpus)} if gpus and self.gpus > 1 else {}
-            result = run_process(replace(task, line=task.line | where), lock, self._follow)
+            result = run_process(replace(task, line=task.line | where), lock, lambda: self._stopped)
             others = len(self._reserved) - 1
         if result.interrupted:
             self._stopped = True  # nothing starts any more, but the artifact of a finished stage is moved into place
@@ -170,22 +105,6 @@ class LocalEngine:
         with self._change:
             self._stopped = True
             self._change.notify_all()
-            for process in self._running:
-                process.send_signal(signal.SIGINT)
-                threading.Timer(GRACE, process.kill).start()
-
-    @contextmanager
-    def _follow(self, process: "subprocess.Popen[str]") -> Iterator[None]:
-        """Register a process inside the context, so that `stop` can interrupt it."""
-        with self._change:
-            self._running.add(process)
-            if self._stopped:
-                process.send_signal(signal.SIGINT)
-        try:
-            yield
-        finally:
-            with self._change:
-                self._running.discard(process)
 
     @contextmanager
     def _reserve(self, resources: Resources) -> Iterator[tuple[list[int], list[str]]]:
@@ -232,75 +151,31 @@ def free_memory_mb() -> int:
     return min(found, default=2**50) // 2**20
 
 
+def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
+    """Estimate the CPU memory in MB to reserve for a stage.
+
+    It is 10 % above the largest peak of this stage in the receipts of the scene and its variants, whatever their
+    profile. Before the first run it follows from the size of all files in the folders of `needs`, by the table `memory`
+    of pipeline.yaml; 0 if the stage is not in the table.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        needs: need -> folder; None if the need is skipped.
+    """
+    if peaks := [r["peak_memory_mb"] for r in earlier_receipts(job, stage) if r.get("peak_memory_mb")]:
+        return round(1.1 * max(peaks))
+    each = job.pipeline.memory.get(stage)
+    read = (path for folder in needs.values() if folder for path in list_files(folder))
+    return round(each.mb + each.each * sum(path.stat().st_size for path in read) / 2**20) if each else 0
+
+
 def visible_gpus() -> list[str]:
     """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them, or else their numbers as text."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     if listed is not None:
         return [number for number in listed.split(",") if number not in ("", "-1")]
     return sorted((path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*")), key=int)
-
-
-def run_process(
-    task: Task,
-    lock: int | None = None,
-    follow: Callable[[Any], Any] = nullcontext,
-    should_stop: Callable[[], bool] | None = None,
-) -> StageResult:
-    """Run a task in a new process on this machine, and wait for its end.
-
-    An interrupt (Ctrl-C) is passed on to the process. It is not raised here, because the stage may have finished; see
-    `StageResult.interrupted`.
-
-    Args:
-        task: the work.
-        lock: file descriptor of a lock that the process keeps open, too; None for no lock.
-        follow: makes a context from the process, which is entered while the process runs.
-        should_stop: called every second; if it returns True, the process is interrupted, and killed if it has not
-            ended after GRACE seconds. None: never.
-    """
-    reader, writer = os.pipe()  # a pipe and not a file, because the answer may be that the disk is full
-    line = json.dumps(task.line | {"result": writer, "lock": lock})
-    answer: dict[str, Any] = {}
-    interrupted = False
-    with open(task.output, "a") if task.output else nullcontext() as output:
-        # The process has a process group of its own, so that Ctrl-C reaches it only once, passed on from here.
-        descriptors = (writer,) if lock is None else (lock, writer)
-        process = start_worker(task.root, "run", pass_fds=descriptors, process_group=0, stdout=output, stderr=output)
-    assert process.stdin
-    os.close(writer)
-    try:
-        with follow(process):
-            with suppress(BrokenPipeError):  # the worker may have ended already; its exit code is read below
-                process.stdin.write(line + "\n")
-                process.stdin.flush()  # the pipe stays open: when this process ends, it closes and the worker ends too
-            code = _poll(process, should_stop) if should_stop else process.wait()
-    except KeyboardInterrupt:
-        code, interrupted = _interrupt(process), True
-    finally:
-        with suppress(BrokenPipeError):
-            process.stdin.close()
-        os.set_blocking(reader, False)  # else reading could wait for processes that the stage started
-        with suppress(BlockingIOError), open(reader, "rb", buffering=0) as file:
-            answer = json.loads(file.read(1 << 16) or "{}")
-    return StageResult(answer, code, interrupted)
-
-
-def _poll(process: "subprocess.Popen[str]", should_stop: Callable[[], bool]) -> int:
-    """Wait for a process, interrupt it as soon as `should_stop` returns True, and return its exit code."""
-    while not should_stop():
-        with suppress(subprocess.TimeoutExpired):
-            return process.wait(1.0)
-    return _interrupt(process)
-
-
-def _interrupt(process: "subprocess.Popen[str]") -> int:
-    """Interrupt a process, kill it if it has not ended after GRACE seconds, and return its exit code."""
-    process.send_signal(signal.SIGINT)
-    try:
-        return process.wait(GRACE)
-    except (subprocess.TimeoutExpired, KeyboardInterrupt):
-        process.kill()
-        return process.wait()
 
 
 # name of the engine -> (its class in <name>_engine.py, the package that this module imports)
@@ -328,7 +203,7 @@ def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -
         raise Refused(f"engine={name}: unknown; known: local, {', '.join(ENGINES)}")
     kind, library = ENGINES[name]
     try:
-        module = importlib.import_module(f"runner.{name}_engine")
+        module = importlib.import_module(f"runner.fleet.{name}_engine")
     except ImportError as error:
         if error.name != library:
             raise

@@ -1,4 +1,7 @@
-"""The command `weights`, which lists the weights that stages need and downloads missing ones."""
+"""The command `weights`, which lists the weights that stages need and downloads missing ones.
+
+The downloads are made by a process of their own, `python -m runner.fleet.weights`, since it imports stages.
+"""
 
 import json
 import sys
@@ -6,7 +9,8 @@ from typing import Any
 
 from runner.process import ask_stages, start_worker
 from runner.resolve import Request, resolve
-from runner.text import format_bytes
+from runner.text import format_bytes, format_error
+from runner.worker import description_file, import_file
 
 
 def fetch_weights(request: Request, offline: bool) -> int:
@@ -42,7 +46,7 @@ def fetch_weights(request: Request, offline: bool) -> int:
     unusable = sum(not need["fetched"] and not need["optional"] for need in missing)
     if offline or not to_fetch:
         return unusable + sum(not need["optional"] for need in to_fetch)
-    process = start_worker(request.root, "fetch")
+    process = start_worker(request.root, module="runner.fleet.weights")
     process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
     return unusable + process.returncode
 
@@ -56,3 +60,39 @@ def _print_problems(missing: list[dict[str, Any]]) -> None:
         names = [need["name"] for need in missing if tuple(need.get("folders", ())) == places]
         if places:
             print(f"looked for {', '.join(names)} in {', '.join(places)}")
+
+
+def fetch() -> int:
+    """Download the missing weights that stages need or could use, each once.
+
+    Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
+
+    Returns:
+        Number of failed downloads of weights that stages need. Errors are printed to the standard error; for weights
+        that stages only could use they are warnings.
+    """
+    downloads, optional = {}, set()
+    for stage, question in json.load(sys.stdin).items():
+        planned = import_file(description_file(stage))
+        params, needs = planned.Params(**question["params"]), []
+        if hasattr(planned, "needed_weights"):
+            needs += planned.needed_weights(params, frozenset(question["brings"]))
+        if hasattr(planned, "optional_weights"):
+            more = planned.optional_weights(params)
+            optional |= {need.name for need in more} - {need.name for need in needs}
+            needs += more
+        downloads |= {need.name: need for need in needs if need.problem and need.fetched}
+    failed = 0
+    for need in downloads.values():
+        try:
+            need.fetch()
+            print(f"{need.name}: fetched", flush=True)
+        except ValueError as error:
+            failed += need.name not in optional
+            words = ("warning", "; the job runs without it") if need.name in optional else ("error", "")
+            print(f"{words[0]}: {format_error(error)}{words[1]}", file=sys.stderr, flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(fetch())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reffusion.clicks import supports
-from reffusion.clicks.propagation import Projection, draw_mask
+from reffusion.clicks import support_planes
+from reffusion.clicks.propagation_with_network import Projection, draw_mask
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence
 
@@ -31,7 +31,7 @@ def support_scene(generator, bumps=0.0):
 def test_a_plane_known_on_one_side_of_the_object_goes_on_at_the_other_side():
     means, ball, plane = support_scene(np.random.default_rng(0))
     known = means[:, 0] > 0
-    found = supports.find_support_gaussians(means, ball & known, plane & known)
+    found = support_planes.find_support_gaussians(means, ball & known, plane & known)
     near = np.linalg.norm(means - np.median(means[ball & known], 0), axis=1) < 1.5
     assert found[plane & near & ~known].all() and found[ball].mean() < 0.02
 
@@ -42,7 +42,7 @@ def test_no_plane_speaks_against_the_object_where_none_supports_it(case):
     known, rug = means[:, 0] > 0, plane & (np.linalg.norm(means, axis=1) < 1)
     is_object = {"a rug is the object": rug & known, "rough ground": ball & known, "nothing labelled": known & False}
     is_other = known & ~ball & ~rug if case == "a rug is the object" else plane & known
-    assert not supports.find_support_gaussians(means, is_object[case], is_other).any()
+    assert not support_planes.find_support_gaussians(means, is_object[case], is_other).any()
 
 
 def test_pixels_that_votes_exclude_are_taken_from_the_networks_mask():

@@ -9,15 +9,16 @@ from functools import partial
 from itertools import count, groupby
 from pathlib import Path
 
-from runner import redirect_output, say
-from runner.engine import GRACE, Engine
+from runner import OUTPUT, say
 from runner.execute import Execution, run_scene
+from runner.fleet.engine import Engine, expected_memory_mb
+from runner.fleet.progress import Progress
 from runner.keys import Hashes
-from runner.progress import Progress
+from runner.process import GRACE
 from runner.resolve import Request
 from runner.text import format_error
 
-OUTPUT = "output.log"  # file in a run's folder with everything that it prints, if runs are parallel
+OUTPUT_FILE = "output.log"  # file in a run's folder with everything that it prints, if runs are parallel
 MAX_SCENES = 256  # largest number of scenes at once, on a cluster
 
 
@@ -74,7 +75,7 @@ def run_all(
 
     Args:
         runs: the runs; those of a group must be neighbors.
-        execution: engine, and number of cores of each stage; its other settings are not used.
+        execution: an engine for several scenes, and number of cores of each stage; its other settings are not used.
         hashes: the cache of hashes.
         stages: names of all stages, for the display of progress.
         on_end: called after each run, failed or not, with its index in `runs` and its outcome, never by two threads at
@@ -83,7 +84,8 @@ def run_all(
     Raises:
         KeyboardInterrupt: the user interrupted the runs (Ctrl-C).
     """
-    engine, cores = execution.engine, execution.cores
+    engine: Engine = execution.engine
+    cores = execution.cores
     groups = [list(places) for _, places in groupby(range(len(runs)), key=lambda place: runs[place].group)]
     cores_each = min(cores or max(1, engine.cores // max(1, len(groups))), engine.cores)
     at_once = min(len(groups), engine.cores // cores_each, MAX_SCENES)
@@ -91,13 +93,14 @@ def run_all(
         for place, run in enumerate(runs):
             if run.announcement:
                 say(run.announcement)
-            on_end(place, _run(run, hashes, Execution(engine, cores and cores_each)))
+            on_end(place, _run(run, hashes, Execution(engine, cores and cores_each, memory_mb=expected_memory_mb)))
         return
     gpu_cores = None if cores or not engine.gpus else max(cores_each, engine.cores // (engine.gpus + 1))
     header = f"{len(groups)} scenes, {at_once} at once, {cores_each} core{'s' * (cores_each > 1)} each"
     homes = [run.home for run in runs]
     with Progress([run.name for run in runs], homes, stages, at_once, header) as progress:
-        run_one = partial(_run_with_progress, progress, hashes, Execution(engine, cores_each, gpu_cores))
+        shared = Execution(engine, cores_each, gpu_cores, memory_mb=expected_memory_mb)
+        run_one = partial(_run_with_progress, progress, hashes, shared)
         _run_in_threads(runs, groups, at_once, run_one, on_end, engine)
 
 
@@ -149,10 +152,13 @@ def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -
 def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: SceneRun) -> Outcome:
     """Do one run, with its output in a file, and report its progress. `place` is the index of the run."""
     run.home.mkdir(parents=True, exist_ok=True)
-    output = run.home / OUTPUT
-    with open(output, "w", encoding="utf-8") as file, redirect_output(lambda text: print(text, file=file, flush=True)):
-        on_change = partial(progress.update, place)
-        outcome = _run(run, hashes, replace(execution, output=output, on_change=on_change))
+    output = run.home / OUTPUT_FILE
+    with open(output, "w", encoding="utf-8") as file:
+        token = OUTPUT.set(file)
+        try:
+            outcome = _run(run, hashes, replace(execution, output=output, on_change=partial(progress.update, place)))
+        finally:
+            OUTPUT.reset(token)
     progress.end(place, outcome.error, outcome.seconds)
     return outcome
 

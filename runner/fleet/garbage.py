@@ -10,9 +10,9 @@ from reffusion.command import scene_name
 from runner import Refused, say
 from runner.artifacts import delete_folder, recover_swap
 from runner.files import RECEIPT, hold_lock, list_files, read_json, read_receipt, read_text
+from runner.fleet.maintenance import artifact_files, is_home, remove_empty
 from runner.frames import FRAME_FILES, FRAMES
 from runner.keys import HASHES, Hashes
-from runner.maintenance import artifact_files, is_home, remove_empty
 from runner.pipeline import find_scene, load_pipeline
 from runner.plan import plan
 from runner.resolve import Request, resolve

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.frame import camera_centers, depths_in_view, nearest_depths
 from reffusion.capture.layouts.capture import NO_POINTS, PointCloud, Poses
 from reffusion.capture.lens import Lens, to_pixels
+from reffusion.capture.normalized_frame import camera_centers, depths_in_view, nearest_depths
 from reffusion.io.colmap import ModelPoints
 from reffusion.io.images import load_thumbnail
 

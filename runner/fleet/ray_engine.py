@@ -15,8 +15,8 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from runner import Failed, Refused
-from runner.engine import GRACE, Resources, StageResult, Task
-from runner.retry import run_attempt
+from runner.fleet.retry import run_attempt
+from runner.process import GRACE, PROJECT, Resources, StageResult, Task
 from runner.text import format_error
 
 RETRIES = 3  # number of times that a stage is started again after its machine was lost
@@ -32,7 +32,7 @@ class RayEngine:
     is_remote, gpus = True, 0
 
     def __init__(self, address: str | None, root: Path, runs: Path):
-        here = os.pathsep.join(dict.fromkeys([str(root), str(Path(__file__).resolve().parent.parent)]))
+        here = os.pathsep.join(dict.fromkeys([str(root), str(PROJECT)]))
         try:
             ray.init(
                 address=address or "auto",
