@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,8 @@ from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
 from reffusion.capture.undistort import load_resized
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, open_image, save_image
+from reffusion.io.given_masks import load_united_masks
+from reffusion.io.images import image_size, open_image, save_image, save_mask
 from reffusion.types import Camera
 
 if TYPE_CHECKING:
@@ -65,7 +67,13 @@ class Reconstruction:
         }
 
 
-def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Reconstruction:
+def reconstruct(
+    photographs: Mapping[str, Path],
+    longest: int,
+    work: Path,
+    seed: int = 0,
+    ignore: Mapping[str, Sequence[Path]] = MappingProxyType({}),
+) -> Reconstruction:
     """Estimate lenses, poses and sparse points of photographs. Their EXIF orientation tags are obeyed.
 
     Photographs of equal size and about equal EXIF focal length share one SIMPLE_RADIAL lens (`group_by_lens`). So that
@@ -78,6 +86,7 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
         longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
         work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
         seed: random seed of COLMAP.
+        ignore: view name -> files of masks of pixels in which no features are searched.
 
     Returns:
         The reconstruction, with lenses for the reduced, upright pictures. Photographs for which COLMAP finds no pose
@@ -89,7 +98,7 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
     import pycolmap
 
     shutil.rmtree(work, ignore_errors=True)
-    pictures, database = work / "images", work / "database.db"
+    pictures, masks, database = work / "images", work / "masks", work / "database.db"
     pictures.mkdir(parents=True)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
@@ -98,8 +107,11 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
         for name in group:
             image = load_resized(photographs[name], longest, upright=True)
             save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
+            if name in ignore:
+                mask = ~load_united_masks(ignore[name], image.shape[:2])
+                save_mask(masks / f"{_file_of(name)}.png", np.rot90(mask) if name in turned else mask)
         _register(database, pictures, [_file_of(name) for name in group], focal)
-    _match(database, pictures, seed)
+    _match(database, pictures, masks if ignore else None, seed)
     model = _reconstruct(database, pictures, work, seed)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
@@ -130,13 +142,14 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
     pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, sorted(files), reader)
 
 
-def _match(database: Path, folder: Path, seed: int) -> None:
-    """Write SIFT features and the matches of all pairs to the database; the number of threads changes nothing."""
+def _match(database: Path, folder: Path, masks: Path | None, seed: int) -> None:
+    """Write SIFT features outside black of masks, and matches of all pairs; the number of threads changes nothing."""
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
     features = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
-    pycolmap.extract_features(database, folder, extraction_options=features, device=cpu)
+    reader = pycolmap.ImageReaderOptions() if masks is None else pycolmap.ImageReaderOptions(mask_path=masks)
+    pycolmap.extract_features(database, folder, reader_options=reader, extraction_options=features, device=cpu)
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed  # of the RANSAC of each pair
