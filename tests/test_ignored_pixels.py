@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import wall_scene
-from scenes.capture import HEIGHT, PINHOLE, RADIAL, WIDTH, make_truth, write_capture, write_masks, write_pictures
+from scenes.capture import HEIGHT, PINHOLE, WIDTH, make_truth, write_capture
 from scenes.capture_checks import assert_message, refusal_message, run_with_messages, write_mask
-from scenes.images import rectangle_mask, render_color
+from scenes.images import rectangle_mask
 from scenes.references import write_wall_stages
 
 from reffusion.capture.sfm import reconstruct
 from reffusion.io.images import load_image, load_mask, save_image, save_mask
-from reffusion.io.ply import load_ply
 from reffusion.params.fit import Params as FitParams
 from reffusion.workspace import Workspace
 from stages import fit, initialize, masks, reference
@@ -41,7 +40,6 @@ def test_one_picture_for_all_views_and_one_of_a_view(tmp_path):
     files = [path for path in (tmp_path / "c").rglob("*") if path.is_file()]
     read = poses_plan.scene_files(poses_plan.Params(), tmp_path / "c", files)
     assert {tmp_path / "c/ignore/all.png", tmp_path / "c/ignore/v01.png"} <= set(read)
-    _, without, _ = run_with_messages(tmp_path / "c", ignore="none")
     assert poses_plan.scene_facts(poses_plan.Params(), tmp_path / "c") != poses_plan.scene_facts(
         poses_plan.Params(ignore="none"), tmp_path / "c"
     )
@@ -71,7 +69,9 @@ def test_wrong_masks_of_ignored_pixels_are_refused(tmp_path):
     write_mask(folder / "ignore/v02.png", np.zeros((60, 60), bool))
     assert "v02.png: 60x60 px, but its view 'v02' has 96x72" in refusal_message(folder)
     write_mask(folder / "ignore/v02.png", ~BONNET)
-    assert "v02.png: all of the view 'v02' is ignored; leave it out instead: `exclude: [v02]`" in refusal_message(folder)
+    assert "v02.png: all of the view 'v02' is ignored; leave it out instead: `exclude: [v02]`" in refusal_message(
+        folder
+    )
 
 
 def test_ignored_pixels_bring_no_features(tmp_path):
@@ -130,7 +130,9 @@ def test_ignored_pixels_influence_nothing(tmp_path):
         for stage in ("again", "masks", "reference", "initialize"):
             (home / stage).mkdir(exist_ok=True)
         fit.run(FitParams(iterations=40), home / "again", poses=folders["poses"])
-        masks.run(masks.Params(), home / "masks", **{k: folders[k] for k in ("poses", "fit")}, raw_masks=home / "raw_masks")
+        masks.run(
+            masks.Params(), home / "masks", **{k: folders[k] for k in ("poses", "fit")}, raw_masks=home / "raw_masks"
+        )
         reference.run(reference.Params(inpainter="exemplar"), home / "reference", **folders)
         initialize.run(
             initialize.Params(refit_steps=20),

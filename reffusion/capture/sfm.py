@@ -156,12 +156,13 @@ def _match(database: Path, folder: Path, masks: Path | None, seed: int) -> None:
     pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=cpu)
 
 
-def _reconstruct(database: Path, pictures: Path, work: Path, seed: int):
-    """Return the `pycolmap.Reconstruction` with the most views, or None if COLMAP finds no reconstruction."""
+def _reconstruct(database: Path, pictures: Path, work: Path, seed: int, is_rig: bool = False):
+    """Return the `pycolmap.Reconstruction` with the most views, or None without any; a rig's lenses and poses stay."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
     options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = not is_rig
     options.mapper.num_threads = 1  # fixes the order of sums, and so the result
     models = pycolmap.incremental_mapping(database, pictures, work, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -317,3 +318,58 @@ def _camera(camera: Camera, image, lens) -> Camera:
     pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
     pose[:3] = image.cam_from_world().matrix()
     return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def reconstruct_rigs(pictures: Path, cameras: Sequence[Camera], model: Path, work: Path, seed: int = 0) -> int:
+    """Place pictures that several cameras of one rig took at the same moments, and write a COLMAP model.
+
+    Lenses, and the cameras' poses in the rig, are known and stay as they are. The result is reproducible.
+
+    Args:
+        pictures: folder with a folder of each camera, which holds its pictures; those of one moment have one name.
+        cameras: the cameras, in the rig's frame; their names are those of the folders.
+        model: folder of the COLMAP model to write.
+        work: temporary folder, which is deleted after success.
+
+    Returns:
+        The number of moments that were placed.
+
+    Raises:
+        BadInput: fewer than 3 moments can be placed.
+    """
+    import pycolmap
+
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.set_random_seed(seed)
+    database = work / "database.db"
+    pycolmap.Database.open(database).close()  # makes the file
+    rig, first = [], cameras[0].world_to_camera
+    for camera in cameras:
+        lens = {"model": "PINHOLE", "params": [camera.fx, camera.fy, camera.cx, camera.cy]}
+        reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=",".join(map(str, lens["params"])))
+        files = sorted(path.relative_to(pictures).as_posix() for path in (pictures / camera.name).iterdir())
+        pycolmap.import_images(database, pictures, pycolmap.CameraMode.SINGLE, files, reader)
+        to_first = camera.world_to_camera @ np.linalg.inv(first)
+        rig.append(
+            pycolmap.RigConfigCamera(
+                ref_sensor=camera is cameras[0],
+                image_prefix=f"{camera.name}/",
+                cam_from_rig=None if camera is cameras[0] else pycolmap.Rigid3d(to_first[:3]),
+            )
+        )
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=rig)], opened)
+    _match(database, pictures, None, seed)
+    found = _reconstruct(database, pictures, work, seed, is_rig=True)
+    placed = 0 if found is None else found.num_reg_frames()
+    if placed < LEAST_VIEWS:
+        count = len(list((pictures / cameras[0].name).iterdir()))
+        raise BadInput(
+            f"{pictures}: {placed} of {count} panoramas were placed; take more, a step apart from each other"
+        )
+    model.mkdir(parents=True)
+    found.write(model)
+    shutil.rmtree(work)
+    return placed

@@ -122,7 +122,7 @@ def save_ignored_pixels(out: Path, name: str, roles: Roles, lens: Lens) -> None:
 
 
 def check_ignored(ignore: Mapping[str, Sequence[Path]]) -> None:
-    """Check masks of what is ignored, view -> files; raises BadInput if one is unreadable or leaves nothing of a view."""
+    """Check masks of what is ignored, view -> files; raises BadInput if one is unreadable or covers a whole view."""
     for name, paths in ignore.items():
         if load_united_masks(paths, mask_file_size(paths[0])[::-1]).all():
             raise BadInput(
