@@ -1,7 +1,10 @@
 """Panoramas are cut into the views that cameras would take at their centers, and placed as rigs."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from PIL import Image
 from scenes.cameras import world_rays
 from scenes.images import psnr
 from scenes.room import speckle_texture
@@ -48,9 +51,9 @@ def textures() -> np.ndarray:
 
 def test_cut_views_are_those_of_cameras_at_the_center(textures):
     center, smooth = np.array([0.3, -0.2, 0.1]), np.repeat(np.repeat(textures[:, ::16, ::16], 16, 1), 16, 2)
-    panorama = make_panorama(center, smooth, 1024)
-    size = view_size(1024)
-    for direction in (*DIRECTIONS, (30.0, 35.0), (200.0, -50.0)):
+    panorama = make_panorama(center, smooth, 512, 2)
+    size = view_size(512)
+    for direction in (DIRECTIONS[0], DIRECTIONS[3], (200.0, -50.0)):
         camera = perspective_camera(direction, size)
         fine = perspective_camera(direction, 3 * size)
         true = look_at_room(center, world_rays(fine), smooth).astype(float).reshape(size, 3, size, 3, 3).mean((1, 3))
@@ -65,7 +68,9 @@ def test_cut_panoramas_are_a_capture_with_true_poses(textures, tmp_path):
     generator = np.random.default_rng(1)
     centers = {f"p{k}": np.array([0.35 * k - 0.7, *generator.uniform(-0.25, 0.25, 2)]) for k in range(5)}
     for name, center in centers.items():
-        save_image(tmp_path / f"pano/images/{name}.png", make_panorama(center, textures, 768, 2))
+        (tmp_path / "pano/images").mkdir(parents=True, exist_ok=True)
+        panorama = Image.fromarray(make_panorama(center, textures, 768, 2))
+        panorama.save(tmp_path / f"pano/images/{name}.jpg", quality=97, xmp=b'GPano:ProjectionType="equirectangular"')
     with pytest.raises(BadInput, match=r"5 of 5 pictures are 360-degree panoramas .*`reffusion panoramas .*/pano`"):
         load_capture(tmp_path / "pano")
     assert "40 views of 5 panoramas" in panoramas.make(str(tmp_path / "pano"), None)
@@ -83,16 +88,14 @@ def test_cut_panoramas_are_a_capture_with_true_poses(textures, tmp_path):
     assert spread * scale < 1e-4
     assert np.abs(distances(ours) * scale - distances(true)).max() < 0.005 * distances(true).max()
     headings = [found[f"{round(d[0]):03d}-p0"][2, :3] for d in DIRECTIONS]
-    assert [float(a @ b) for a, b in zip(headings, headings[1:], strict=False)] == pytest.approx(
-        [0.5**0.5] * 7, abs=1e-5
-    )
+    assert [float(a @ b) for a, b in pairwise(headings)] == pytest.approx([0.5**0.5] * 7, abs=1e-5)
     with pytest.raises(ValueError, match="not empty"):
         panoramas.make(str(tmp_path / "pano"), None)
 
 
 def test_other_pictures_are_no_panoramas(tmp_path):
     save_image(tmp_path / "c/images/a.png", np.zeros((60, 100, 3), np.uint8))
-    with pytest.raises(ValueError, match="a.png: 100x60 px; an equirectangular panorama is twice as wide as high"):
+    with pytest.raises(ValueError, match=r"a\.png: 100x60 px; an equirectangular panorama is twice as wide as high"):
         panoramas.make(str(tmp_path / "c"), None)
     with pytest.raises(ValueError, match="nowhere: no such folder or video"):
         panoramas.make(str(tmp_path / "nowhere"), None)

@@ -107,7 +107,8 @@ def load_roles(
     - the views of the test masks (usually in `<pictures>/test_label`), except those that `train` names. If the test
       masks are named like views, their names decide. Otherwise they belong, in order, to the views without a training
       mask; or, if some training masks are missing too, to the first views of the capture;
-    - the views that the layout itself holds out (`Capture.test`), except those that `train` names.
+    - the views that the layout itself holds out (`Capture.test`), except those that `train` names;
+    - the views whose pictures are called test_*, if most are not, except those that `train` names.
 
     Training views are the views that `train` names, else all views that are neither test nor camera-only views, without
     those in neither list of the layout's own (`Capture.unused`). All other views are left out of the scene, unless they
@@ -245,7 +246,7 @@ def _split_views(
     capture: Capture,
 ) -> tuple[list[str], list[str]]:
     """Return the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
-    test_views = test if test is not None else (labelled or [*capture.test])
+    test_views = test if test is not None else (labelled or [*capture.test] or _views_named_test(capture))
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *camera_only, *capture.unused}]
     elif test is None:
@@ -254,6 +255,12 @@ def _split_views(
     if both:
         raise BadInput(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
     return train, test_views
+
+
+def _views_named_test(capture: Capture) -> list[str]:
+    """Return the views whose pictures are called test_*, if most are not (in Inpaint360GS these lack the object)."""
+    found = [name for name, path in capture.pictures.items() if path.name.startswith("test_")]
+    return found if 2 * len(found) < len(capture.pictures) else []
 
 
 def _camera_only_views(
