@@ -296,9 +296,8 @@ def test_pictures_called_test_are_test_views(tmp_path, marked):
     """Inpaint360GS has photographs without the object, test_*, beside the others; clicks bring no masks to tell."""
     names = [f"IMG_{k}" for k in range(4)] + ["test_IMG_1", "test_IMG_2"]
     truth = make_truth()
-    write_capture(
-        tmp_path / "c", "colmap", rename_views(truth, dict(zip(names, sorted(truth.world_to_camera), strict=True)))
-    )
+    renamed = rename_views(truth, dict(zip(sorted(truth.world_to_camera), names, strict=True)))
+    write_capture(tmp_path / "c", "colmap", renamed)
     if marked == "clicks":
         shutil.rmtree(tmp_path / "c/masks")
     else:

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from scenes.cameras import world_rays
 from scenes.images import psnr
 from scenes.room import speckle_texture
@@ -66,11 +67,13 @@ def test_cut_views_are_those_of_cameras_at_the_center(textures):
 
 def test_cut_panoramas_are_a_capture_with_true_poses(textures, tmp_path):
     generator = np.random.default_rng(1)
+    declared = PngInfo()
+    declared.add_itxt("XML:com.adobe.xmp", 'GPano:ProjectionType="equirectangular"')
     centers = {f"p{k}": np.array([0.35 * k - 0.7, *generator.uniform(-0.25, 0.25, 2)]) for k in range(5)}
     for name, center in centers.items():
         (tmp_path / "pano/images").mkdir(parents=True, exist_ok=True)
         panorama = Image.fromarray(make_panorama(center, textures, 768, 2))
-        panorama.save(tmp_path / f"pano/images/{name}.jpg", quality=97, xmp=b'GPano:ProjectionType="equirectangular"')
+        panorama.save(tmp_path / f"pano/images/{name}.png", pnginfo=declared)
     with pytest.raises(BadInput, match=r"5 of 5 pictures are 360-degree panoramas .*`reffusion panoramas .*/pano`"):
         load_capture(tmp_path / "pano")
     assert "40 views of 5 panoramas" in panoramas.make(str(tmp_path / "pano"), None)
