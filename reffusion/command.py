@@ -17,6 +17,7 @@ COMMANDS = {
     "app": ("report.app", "one page from photographs to the finished scene, in a browser"),
     "mask": ("report.mask", "make masks from clicks, in a browser"),
     "check": ("report.check", "look for problems of photographs, masks and poses; draw each mask over its photograph"),
+    "panoramas": ("report.panoramas", "cut 360-degree photographs or a video into views of known poses"),
     "report": ("report.job", "a page on a job: stages, results, errors against time"),
     "view": ("report.view", "view the finished scene in a browser (extra `view`)"),
     "turntable": ("report.turntable", "a video of the finished scene"),

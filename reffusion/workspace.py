@@ -20,7 +20,7 @@ from reffusion.background.visibility import render_depth_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_object_labels, load_scene
+from reffusion.io.scene import load_ignored, load_mask_sets, load_object_labels, load_scene
 from reffusion.masks.soft_shadow import SoftShadow
 from reffusion.prior import inpaint
 from reffusion.types import Gaussians, MaskSet, Scene
@@ -117,11 +117,17 @@ class Workspace:
         return photos
 
     def hidden(self, name: str) -> np.ndarray:
-        """Return bool [H, W], the pixels where a view's photograph shows the object.
+        """Return bool [H, W], the pixels where a view's photograph shows the object, or what the scene ignores.
 
-        These are the pixels of C. In a clean view (photographed without the object) no pixel is True.
+        The object is at the pixels of C. A clean view (photographed without the object) does not show it.
         """
-        return self.mask_sets[name].consistent & (name not in self.scene.clean)
+        hidden = self.mask_sets[name].consistent & (name not in self.scene.clean)
+        return hidden | self.ignored[name] if name in self.ignored else hidden
+
+    @cached_property
+    def ignored(self) -> dict[str, np.ndarray]:
+        """Pixels of photographs that neither train nor are filled (`load_ignored`)."""
+        return load_ignored(self.poses, [self.scene.cameras[name] for name in self.scene.train])
 
     def remove_object(self, name: str) -> np.ndarray:
         """Return a view without the object, uint8 [H, W, 3].

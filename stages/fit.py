@@ -26,7 +26,7 @@ from reffusion.fit.reconstruction import fit
 from reffusion.fit.step import REFIT_RATES
 from reffusion.inpaint import classical
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from reffusion.io.scene import load_ignored, load_raw_masks, load_scene, load_views
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Scene
@@ -53,10 +53,11 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     held_out_names = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out_names]
     images = load_views(poses, scene.train)
-    hidden: dict[str, np.ndarray] = {}
+    hidden = load_ignored(poses, [scene.cameras[name] for name in scene.train])
     if params.pixels == "unmasked":
         assert raw_masks is not None
-        hidden = load_hidden_pixels(raw_masks, scene)
+        masks = load_hidden_pixels(raw_masks, scene)
+        hidden |= {name: mask | hidden.get(name, mask) for name, mask in masks.items()}
     # Masked pixels are inpainted (Telea), because optical flow reads them although they do not supervise.
     images |= {name: classical.telea(images[name], mask) for name, mask in hidden.items()}
     gains = estimate_exposures(params, scene, cameras, images)

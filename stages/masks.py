@@ -28,6 +28,7 @@ from reffusion.io.scene import (
     WARNINGS,
     list_objects,
     load_fill_masks,
+    load_ignored,
     load_raw_masks,
     load_scene,
     load_views,
@@ -78,14 +79,20 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
+    ignored = load_ignored(poses, train)
     ballots = {name: raw[name] for name in scene.train if name in raw}
     ballots |= {name: empty[name] for name in scene.clean} if raw else {}
-    labels = deleted if deleted is not None else consolidation.label_object(params, gaussians, train, ballots, region)
+    labels = (
+        deleted
+        if deleted is not None
+        else consolidation.label_object(params, gaussians, train, ballots, ignored, region)
+    )
     photo_of = lambda name: load_views(poses, [name])[name]
     labels, consistent, remnants = complete_object(params, scene, gaussians, labels, out, photo_of, bool(raw))
     if deleted is not None:
         labels = deleted | limit_extras(labels & ~deleted, deleted, "inside", out)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
+    hidden |= {name: hidden[name] | mask for name, mask in ignored.items()}
 
     background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
     needs_surfaces = params.shadows or consolidation.needs_unobserved(params, fill)

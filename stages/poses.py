@@ -29,6 +29,7 @@ from reffusion.capture.undistort import (
     fitting_size,
     load_resized,
     resized_lens,
+    save_ignored_pixels,
     save_undistorted_view,
 )
 from reffusion.capture.views import check_outliers
@@ -58,6 +59,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     Writes:
 
     - images/<view>.png, the undistorted pictures, for each view that has one;
+    - ignored/<view>.png, the pixels of these pictures that the scene ignores, if it has masks of such pixels;
     - sparse/0/ (cameras and points, COLMAP), transform.json (normalised frame), views.json (roles) and lenses.json;
     - sfm.json, if poses are estimated by structure from motion;
     - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
@@ -93,7 +95,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     messages += describe_transparency([*roles.train, *roles.test], capture)
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
-        everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture)
+        everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture, roles)
         if lost := [name for name in everyone if name not in capture.pictures]:
             messages.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
         roles = roles.restrict(set(capture.pictures))
@@ -101,6 +103,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
         lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
+        save_ignored_pixels(out, views[k], roles, lenses[views[k]])
     for name in roles.camera_only:
         lenses[name], pinholes[name] = resized_lens(name, capture, longest)
     assert capture.poses is not None
@@ -349,9 +352,9 @@ def _add_flow_points(scene: Scene, out: Path) -> Scene:
     )
 
 
-def _run_sfm(params: Params, out: Path, capture: Capture) -> Capture:
+def _run_sfm(params: Params, out: Path, capture: Capture, roles: Roles) -> Capture:
     """Estimate the poses by structure from motion, leave out views that could not be placed, and write sfm.json."""
-    found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED)
+    found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED, roles.ignore)
     facts = found.facts()
     print(facts["summary"], flush=True)
     save_json(out / SFM_FACTS, facts)

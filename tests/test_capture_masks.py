@@ -289,3 +289,23 @@ def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
     scene, _, sentences = run_with_messages(tmp_path / "s")
     assert_cameras(scene, truth)
     assert_message(sentences, "order")
+
+
+@pytest.mark.parametrize("marked", ["clicks", "masks"])
+def test_pictures_called_test_are_test_views(tmp_path, marked):
+    """Inpaint360GS has photographs without the object, test_*, beside the others; clicks bring no masks to tell."""
+    names = [f"IMG_{k}" for k in range(4)] + ["test_IMG_1", "test_IMG_2"]
+    truth = make_truth()
+    renamed = rename_views(truth, dict(zip(sorted(truth.world_to_camera), names, strict=True)))
+    write_capture(tmp_path / "c", "colmap", renamed)
+    if marked == "clicks":
+        shutil.rmtree(tmp_path / "c/masks")
+    else:
+        for path in (tmp_path / "c").rglob("masks/test_*"):
+            path.unlink()
+    params = {"clicks": {"IMG_0": [[30, 30, "+"]]}} if marked == "clicks" else {}
+    scene, _, sentences = run_with_messages(tmp_path / "c", **params)
+    assert scene.test == ("test_IMG_1", "test_IMG_2") and scene.train == tuple(names[:4])
+    assert_message(sentences, "4 photographs build the scene; 2 are kept to test it")
+    scene, _, _ = run_with_messages(tmp_path / "c", train=names, **params)
+    assert len(scene.train) == 6

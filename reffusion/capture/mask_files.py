@@ -19,6 +19,7 @@ from reffusion.io.images import ENDINGS
 from reffusion.params.capture import MaskSpec
 
 NONE = "none"
+IGNORE, ALL_VIEWS = "ignore", "all"  # usual folder of masks of what is ignored, and the name of a mask for every view
 COMPANIONS = (".txt", ".xml", ".xmp", ".csv", ".yaml", ".thm", "")  # endings of files beside a picture that are none
 USUAL = (
     "masks",
@@ -95,6 +96,32 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
         f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
         "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
     )
+
+
+def find_ignore_masks(folder: Path, capture: Capture, name: str | None) -> dict[str, tuple[Path, ...]]:
+    """Return view -> files of the masks of what is ignored in it: one named like its picture, one for all views.
+
+    Args:
+        folder: the scene's folder.
+        name: the key `ignore` of scene.yaml: the folder of the masks; "none" for none; None for the usual folder.
+
+    Raises:
+        BadInput: a folder that is named holds no masks, a mask belongs to no picture, or two belong to one.
+    """
+    if name is not None and name.lower() == NONE:
+        return {}
+    place, files = _mask_paths(folder / (name or IGNORE), capture)
+    if not files and (name is not None or place.is_dir()):
+        raise BadInput(
+            f"{place}: no masks there{_unread(place)}; correct `ignore` in scene.yaml, or say `ignore: none`"
+        )
+    shared = [path for path in files if strip_ending(path) == ALL_VIEWS]
+    named = match_masks(place, [path for path in files if path not in shared], capture)
+    own = _assign_masks(place, named, capture)
+    found = {
+        view: (*(place / path for path in shared), *([own[view]] if view in own else [])) for view in capture.pictures
+    }
+    return {view: paths for view, paths in found.items() if paths}
 
 
 def _pictures_folder(capture: Capture) -> Path | None:

@@ -15,7 +15,7 @@ from typing import TypeVar
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
-MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # sub-folders of a folder of pictures that hold masks
+MASK_FOLDERS = ("label", "test_label", "masks", "mask", "ignore")  # sub-folders of a folder of pictures that hold masks
 MASK_WORDS = ("mask", "msk", "seg", "segmentation", "matte", "alpha", "silhouette", "label")
 MASK_SUFFIXES = tuple(mark + word for mark in "_-." for word in MASK_WORDS)  # `A_mask.png` beside `A.png` is its mask
 MASK_PREFIXES = ("dynamic_mask_", "mask_")  # so is `mask_A.png`

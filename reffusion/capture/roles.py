@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.mask_files import NONE, find_masks, match_masks
+from reffusion.capture.mask_files import NONE, find_ignore_masks, find_masks, match_masks
 from reffusion.capture.names import list_pictures
 from reffusion.capture.views import ViewTable, check_proportions, resolve_view
 from reffusion.io.files import BadInput
@@ -39,6 +39,7 @@ class Roles:
         camera_only: names of the camera-only views. They are neither training nor test views.
         values: the pixel values in `masks` that mark the object.
         fill: training view -> file of a mask of the pixels to fill, whatever the photograph shows there.
+        ignore: view -> files of masks of pixels that neither train nor are filled, such as those of a passer-by.
         keep: names of views that stay in the scene even if their photographs contradict their poses.
     """
 
@@ -51,6 +52,7 @@ class Roles:
     camera_only: tuple[str, ...] = ()
     values: MaskValues = WHITE
     fill: dict[str, Path] = field(default_factory=dict)
+    ignore: dict[str, tuple[Path, ...]] = field(default_factory=dict)
     keep: frozenset[str] = frozenset()
 
     @property
@@ -78,6 +80,7 @@ class Roles:
             masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
             fill=kept(self.fill),
+            ignore=kept(self.ignore),
         )
         _check_enough(roles.train, bool(roles.camera_only))
         return roles
@@ -89,6 +92,7 @@ def load_roles(
     *,
     masks: str | MaskSpec | None = None,
     test_masks: str | None = None,
+    ignore: str | None = None,
     train: Sequence[str] | str | None = None,
     test: Sequence[str] | str | None = None,
     clean: Sequence[str] = (),
@@ -103,7 +107,8 @@ def load_roles(
     - the views of the test masks (usually in `<pictures>/test_label`), except those that `train` names. If the test
       masks are named like views, their names decide. Otherwise they belong, in order, to the views without a training
       mask; or, if some training masks are missing too, to the first views of the capture;
-    - the views that the layout itself holds out (`Capture.test`), except those that `train` names.
+    - the views that the layout itself holds out (`Capture.test`), except those that `train` names;
+    - the views whose pictures are called test_*, if most are not, except those that `train` names.
 
     Training views are the views that `train` names, else all views that are neither test nor camera-only views, without
     those in neither list of the layout's own (`Capture.unused`). All other views are left out of the scene, unless they
@@ -116,6 +121,7 @@ def load_roles(
             that the layout names.
         test_masks: folder of the masks of test views, named like the views or sorted like them. "none" if there are
             none; None searches `<pictures>/test_label`.
+        ignore: folder of the masks of what neither trains nor is filled, see `find_ignore_masks`.
         train, test: names of views, or "every 8" for the first of each eight in the order of `Capture.pictures`; None
             if not given.
         clean: names of training views in which the object is absent.
@@ -153,9 +159,20 @@ def load_roles(
     training_masks = {thing: _restrict_files(files, {*kept, *held_out}) for thing, files in of_objects.items()}
     for name, path in (*(item for files in training_masks.values() for item in files.items()), *test_files.items()):
         check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
+    ignored = {
+        name: paths
+        for name, paths in find_ignore_masks(folder, capture, ignore).items()
+        if name in {*train_named, *test_views}
+    }
+    for name, path in ((name, path) for name, paths in ignored.items() for path in paths):
+        check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
     unmasked = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
-    messages = tuple(filter(None, (found.warning, warning)))
+    if scored := [name for name in test_views if name in ignored]:
+        counted = f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}"
+    else:
+        counted = None
+    messages = tuple(filter(None, (found.warning, warning, counted)))
     return Roles(
         tuple(train_named),
         tuple(test_views),
@@ -165,6 +182,7 @@ def load_roles(
         messages,
         camera_only,
         found.values,
+        ignore=ignored,
     )
 
 
@@ -228,7 +246,7 @@ def _split_views(
     capture: Capture,
 ) -> tuple[list[str], list[str]]:
     """Return the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
-    test_views = test if test is not None else (labelled or [*capture.test])
+    test_views = test if test is not None else (labelled or [*capture.test] or _views_named_test(capture))
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *camera_only, *capture.unused}]
     elif test is None:
@@ -237,6 +255,12 @@ def _split_views(
     if both:
         raise BadInput(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
     return train, test_views
+
+
+def _views_named_test(capture: Capture) -> list[str]:
+    """Return the views whose pictures are called test_*, if most are not (in Inpaint360GS these lack the object)."""
+    found = [name for name, path in capture.pictures.items() if path.name.startswith("test_")]
+    return found if 2 * len(found) < len(capture.pictures) else []
 
 
 def _camera_only_views(

@@ -44,6 +44,7 @@ def read_scene(
         capture,
         masks=params.masks,
         test_masks=params.test_masks,
+        ignore=params.ignore,
         train=params.train,
         test=params.test,
         clean=params.clean,
@@ -129,7 +130,7 @@ def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
     if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
         return False
     about_views = ("train", "test", "clean", "cameras_only", "exclude", "keep")
-    for key in (*about_views, "test_masks", "fill", "remove", "region", "masks"):
+    for key in (*about_views, "test_masks", "ignore", "fill", "remove", "region", "masks"):
         if getattr(params, key) and (key != "masks" or params.has_masks):
             raise BadInput(f"scene.yaml: {key}: the scene has no photographs; add them, or remove the key")
     return True

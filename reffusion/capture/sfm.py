@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,8 @@ from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
 from reffusion.capture.undistort import load_resized
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, open_image, save_image
+from reffusion.io.given_masks import load_united_masks
+from reffusion.io.images import image_size, open_image, save_image, save_mask
 from reffusion.types import Camera
 
 if TYPE_CHECKING:
@@ -65,7 +67,13 @@ class Reconstruction:
         }
 
 
-def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Reconstruction:
+def reconstruct(
+    photographs: Mapping[str, Path],
+    longest: int,
+    work: Path,
+    seed: int = 0,
+    ignore: Mapping[str, Sequence[Path]] = MappingProxyType({}),
+) -> Reconstruction:
     """Estimate lenses, poses and sparse points of photographs. Their EXIF orientation tags are obeyed.
 
     Photographs of equal size and about equal EXIF focal length share one SIMPLE_RADIAL lens (`group_by_lens`). So that
@@ -78,6 +86,7 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
         longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
         work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
         seed: random seed of COLMAP.
+        ignore: view name -> files of masks of pixels in which no features are searched.
 
     Returns:
         The reconstruction, with lenses for the reduced, upright pictures. Photographs for which COLMAP finds no pose
@@ -89,7 +98,7 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
     import pycolmap
 
     shutil.rmtree(work, ignore_errors=True)
-    pictures, database = work / "images", work / "database.db"
+    pictures, masks, database = work / "images", work / "masks", work / "database.db"
     pictures.mkdir(parents=True)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
@@ -98,8 +107,11 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
         for name in group:
             image = load_resized(photographs[name], longest, upright=True)
             save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
+            if name in ignore:
+                mask = ~load_united_masks(ignore[name], image.shape[:2])
+                save_mask(masks / f"{_file_of(name)}.png", np.rot90(mask) if name in turned else mask)
         _register(database, pictures, [_file_of(name) for name in group], focal)
-    _match(database, pictures, seed)
+    _match(database, pictures, masks if ignore else None, seed)
     model = _reconstruct(database, pictures, work, seed)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
@@ -130,25 +142,27 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
     pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, sorted(files), reader)
 
 
-def _match(database: Path, folder: Path, seed: int) -> None:
-    """Write SIFT features and the matches of all pairs to the database; the number of threads changes nothing."""
+def _match(database: Path, folder: Path, masks: Path | None, seed: int) -> None:
+    """Write SIFT features outside black of masks, and matches of all pairs; the number of threads changes nothing."""
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
     features = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
-    pycolmap.extract_features(database, folder, extraction_options=features, device=cpu)
+    reader = pycolmap.ImageReaderOptions() if masks is None else pycolmap.ImageReaderOptions(mask_path=masks)
+    pycolmap.extract_features(database, folder, reader_options=reader, extraction_options=features, device=cpu)
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed  # of the RANSAC of each pair
     pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=cpu)
 
 
-def _reconstruct(database: Path, pictures: Path, work: Path, seed: int):
-    """Return the `pycolmap.Reconstruction` with the most views, or None if COLMAP finds no reconstruction."""
+def _reconstruct(database: Path, pictures: Path, work: Path, seed: int, is_rig: bool = False):
+    """Return the `pycolmap.Reconstruction` with the most views, or None without any; a rig's lenses and poses stay."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
     options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = not is_rig
     options.mapper.num_threads = 1  # fixes the order of sums, and so the result
     models = pycolmap.incremental_mapping(database, pictures, work, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -304,3 +318,58 @@ def _camera(camera: Camera, image, lens) -> Camera:
     pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
     pose[:3] = image.cam_from_world().matrix()
     return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def reconstruct_rigs(pictures: Path, cameras: Sequence[Camera], model: Path, work: Path, seed: int = 0) -> int:
+    """Place pictures that several cameras of one rig took at the same moments, and write a COLMAP model.
+
+    Lenses, and the cameras' poses in the rig, are known and stay as they are. The result is reproducible.
+
+    Args:
+        pictures: folder with a folder of each camera, which holds its pictures; those of one moment have one name.
+        cameras: the cameras, in the rig's frame; their names are those of the folders.
+        model: folder of the COLMAP model to write.
+        work: temporary folder, which is deleted after success.
+
+    Returns:
+        The number of moments that were placed.
+
+    Raises:
+        BadInput: fewer than 3 moments can be placed.
+    """
+    import pycolmap
+
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.set_random_seed(seed)
+    database = work / "database.db"
+    pycolmap.Database.open(database).close()  # makes the file
+    rig, first = [], cameras[0].world_to_camera
+    for camera in cameras:
+        lens = {"model": "PINHOLE", "params": [camera.fx, camera.fy, camera.cx, camera.cy]}
+        reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=",".join(map(str, lens["params"])))
+        files = sorted(path.relative_to(pictures).as_posix() for path in (pictures / camera.name).iterdir())
+        pycolmap.import_images(database, pictures, pycolmap.CameraMode.SINGLE, files, reader)
+        to_first = camera.world_to_camera @ np.linalg.inv(first)
+        rig.append(
+            pycolmap.RigConfigCamera(
+                ref_sensor=camera is cameras[0],
+                image_prefix=f"{camera.name}/",
+                cam_from_rig=None if camera is cameras[0] else pycolmap.Rigid3d(to_first[:3]),
+            )
+        )
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=rig)], opened)
+    _match(database, pictures, None, seed)
+    found = _reconstruct(database, pictures, work, seed, is_rig=True)
+    placed = 0 if found is None else found.num_reg_frames()
+    if placed < LEAST_VIEWS:
+        count = len(list((pictures / cameras[0].name).iterdir()))
+        raise BadInput(
+            f"{pictures}: {placed} of {count} panoramas were placed; take more, a step apart from each other"
+        )
+    model.mkdir(parents=True)
+    found.write(model)
+    shutil.rmtree(work)
+    return placed

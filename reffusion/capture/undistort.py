@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undistortion_map
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import WHITE, MaskValues, load_given_mask
+from reffusion.io.given_masks import WHITE, MaskValues, load_given_mask, load_united_masks, mask_file_size
 from reffusion.io.images import image_size, load_alpha, load_image, resize_image, save_image, save_mask
+from reffusion.io.scene import IGNORED
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -108,6 +109,25 @@ def load_undistorted_mask(path: Path, lens: Lens, values: MaskValues = WHITE) ->
     """
     mask, where = load_given_mask(path, (lens.height, lens.width), values), undistortion_map(lens)[1]
     return mask if where is None else undistort_mask(mask, where)
+
+
+def save_ignored_pixels(out: Path, name: str, roles: Roles, lens: Lens) -> None:
+    """Write the pixels of the view `name` that are ignored to `out`/ignored/<view>.png, if masks mark some.
+
+    Args:
+        lens: lens of the view's photograph at the size of the undistorted picture.
+    """
+    if masks := [load_undistorted_mask(path, lens) for path in roles.ignore.get(name, ())]:
+        save_mask(out / IGNORED / f"{name}.png", np.logical_or.reduce(masks))
+
+
+def check_ignored(ignore: Mapping[str, Sequence[Path]]) -> None:
+    """Check masks of what is ignored, view -> files; raises BadInput if one is unreadable or covers a whole view."""
+    for name, paths in ignore.items():
+        if load_united_masks(paths, mask_file_size(paths[0])[::-1]).all():
+            raise BadInput(
+                f"{paths[-1]}: all of the view '{name}' is ignored; leave it out instead: `exclude: [{name}]`"
+            )
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:

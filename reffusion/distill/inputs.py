@@ -93,6 +93,8 @@ def load_train_views(
         repaint = (pixels.invent if params.repaint == "invent" else hidden) & (not clean)
         # C shows the object. Pixels of I outside C are the place of an object to be inserted.
         supervises = (~hidden | clean) & (name not in scene.camera_only)
+        if name in space.ignored:
+            supervises &= ~space.ignored[name]
         if name in shadows:
             supervises &= ~load_mask(shadows[name])
         lifted = to_device(inpainted[name]) / 255 if name in inpainted else None

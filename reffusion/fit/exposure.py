@@ -23,7 +23,7 @@ from reffusion.fit.gains import BRIGHT, DARK
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import has_photograph, load_scene, load_views
+from reffusion.io.scene import has_photograph, load_ignored, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera
 
@@ -226,7 +226,7 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
     """Load the photographs of the named views, with the exposure of the Gaussians (see `normalize_exposure`).
 
     A photograph without a fitted exposure, as a test view's, is loaded as it is. A view without a photograph gets a
-    rendering of the fitted Gaussians, object included.
+    rendering of the fitted Gaussians, object included, and so do the pixels that the scene ignores (`load_ignored`).
 
     Args:
         poses, fit: folders of the stages of these names.
@@ -238,8 +238,11 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
     names = list(names)
     photographed = [name for name in names if has_photograph(poses, name)]
     photos = {name: normalize_exposure(image, fit, name) for name, image in load_views(poses, photographed).items()}
-    renderings = render_views(poses, fit, [name for name in names if name not in photos])
-    return {name: (photos | renderings)[name] for name in names}
+    cameras = load_scene(poses).cameras
+    ignored = {name: each for name, each in load_ignored(poses, map(cameras.__getitem__, photos)).items() if each.any()}
+    renderings = render_views(poses, fit, [name for name in names if name not in photos or name in ignored])
+    mixed = {name: np.where(each[..., None], renderings[name], photos[name]) for name, each in ignored.items()}
+    return {name: (renderings | photos | mixed)[name] for name in names}
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ The brightness of a pixel is its largest channel, scaled to [0, 255].
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,6 +90,11 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
             mask = _numbered_pixels(path, image, values.ids) if values.ids else _find_marked_pixels(path, image)
     mask = mask ^ values.inverted
     return mask if size is None else resize_nearest(mask, size)
+
+
+def load_united_masks(paths: Sequence[Path], size: tuple[int, int]) -> np.ndarray:
+    """Read masks of one picture as bool [H, W], True where one of them is white; `size` is (height, width)."""
+    return np.logical_or.reduce([load_given_mask(path, size) for path in paths])
 
 
 def _load_array(path: Path) -> np.ndarray:

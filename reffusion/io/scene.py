@@ -1,8 +1,8 @@
 """Reading and writing of the files that stages hand on: scenes, views, masks and references.
 
-The stage `poses` writes images/<view>.png, sparse/0/*.bin, transform.json, views.json and lenses.json. The stage
-`raw_masks` writes masks/<view>.png (or masks/<object>/<view>.png if the scene has masks of several objects),
-test_masks/<view>.png and fill/<view>.png. Terms of masks are explained in `reffusion.types.MaskSet`.
+The stage `poses` writes images/<view>.png, ignored/<view>.png, sparse/0/*.bin, transform.json, views.json and
+lenses.json. The stage `raw_masks` writes masks/<view>.png (or masks/<object>/<view>.png if the scene has masks of
+several objects), test_masks/<view>.png and fill/<view>.png. Terms of masks are explained in `reffusion.types.MaskSet`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from reffusion.io.images import load_exr, load_image, load_mask, save_exr, save_
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from reffusion.types import MaskSet, Reference, Scene
+    from reffusion.types import Camera, MaskSet, Reference, Scene
 
 WARNINGS = "warnings.json"  # in the folder of a stage: sentences about what looks wrong in its input
+IGNORED = "ignored"  # in the folder of `poses`: masks of the pixels of a photograph that neither train nor are filled
 PIXEL_CLASSES = ("raw", "consistent", "unobserved", "invent")
 
 
@@ -87,6 +88,22 @@ def load_scene(poses_dir: Path) -> Scene:
 def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read the undistorted pictures of the named views, as a dict view name -> uint8 [H, W, 3]."""
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
+
+
+def load_ignored(poses_dir: Path, cameras: Iterable[Camera]) -> dict[str, np.ndarray]:
+    """Read which pixels of photographs are ignored, as a dict view name -> bool [H, W].
+
+    They show what passes by or what moves with the camera: they neither train nor are filled. The dict is empty if the
+    scene ignores nothing; else every view has an entry.
+    """
+    cameras, folder = list(cameras), Path(poses_dir) / IGNORED
+    if not folder.is_dir():
+        return {}
+    return {
+        each.name: load_mask(path) if (path := folder / f"{each.name}.png").is_file() else np.zeros(size, bool)
+        for each in cameras
+        for size in [(each.height, each.width)]
+    }
 
 
 def has_photograph(poses_dir: Path, name: str) -> bool:

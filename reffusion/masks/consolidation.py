@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -35,6 +36,7 @@ def label_object(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     ballots: Mapping[str, np.ndarray],
+    ignored: Mapping[str, np.ndarray],
     region: Region | None,
 ) -> Tensor:
     """Label the Gaussians of the object: by votes of the raw masks, or without masks by a region in space.
@@ -48,6 +50,7 @@ def label_object(
         cameras: the training views.
         ballots: view name -> bool [H, W], raw masks of the views that vote, True at pixels of the object. Empty if the
             scene has no masks.
+        ignored: view name -> bool [H, W], pixels that do not vote; a view without an entry has none.
         region: region of space that the scene names; None if it names none.
 
     Returns:
@@ -59,8 +62,9 @@ def label_object(
             return torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         return regions.inside_region(gaussians, region)
     # Blending weights tell whether a Gaussian is seen at all, also if the votes are counts.
-    weights = voting.cast_votes(gaussians, cameras, ballots, mode="weight")
-    votes = weights if params.vote == "weight" else voting.cast_votes(gaussians, cameras, ballots, mode=params.vote)
+    cast = partial(voting.cast_votes, gaussians, cameras, ballots, ignored=ignored)
+    weights = cast(mode="weight")
+    votes = weights if params.vote == "weight" else cast(mode=params.vote)
     labels = voting.label_gaussians(votes, params.tau)
     # Gaussians that hardly any view sees, e.g. inside the object or in the wall behind the object, are labelled by
     # their position. PAPER leaves open: the ratio of votes 0 / 0 of Gaussians that no view sees.

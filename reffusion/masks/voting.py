@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -35,7 +36,12 @@ class Votes:
 
 
 def cast_votes(
-    gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], *, mode: VoteMode = "weight"
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    masks: Mapping[str, np.ndarray],
+    *,
+    mode: VoteMode = "weight",
+    ignored: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> Votes:
     """Sum the votes of all views that have a mask.
 
@@ -49,6 +55,7 @@ def cast_votes(
         masks: view name -> bool [H, W], True at pixels of the object. A view with an empty mask votes, too: all its
             pixels are unmasked. A view without an entry does not vote.
         mode: value of one contribution: "count" for 1, "weight" for its blending weight.
+        ignored: view name -> bool [H, W], pixels that do not vote; a view without an entry has none.
 
     Raises:
         ValueError: no view has a mask, or a mask does not have the size of its view.
@@ -64,7 +71,8 @@ def cast_votes(
     total = torch.zeros(len(gaussians), 2, dtype=gaussians.means.dtype, device=gaussians.means.device)
     for camera in voters:
         mask = torch.as_tensor(masks[camera.name], device=total.device)
-        ballots = torch.stack([mask, ~mask], -1).to(total.dtype)
+        votes = torch.as_tensor(~ignored.get(camera.name, np.zeros(mask.shape, bool)), device=total.device)
+        ballots = torch.stack([mask & votes, ~mask & votes], -1).to(total.dtype)
         total += rasterizer.accumulate(gaussians, camera, ballots, count=mode == "count")
     return Votes(total[:, 0], total[:, 1])
 

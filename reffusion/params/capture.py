@@ -69,6 +69,12 @@ class SceneKeys(Settings):
     test_masks: str | None = Field(
         None, description="folder of masks of test views, by name or in their order", json_schema_extra=UNKEYED
     )
+    ignore: str | None = Field(
+        None,
+        description='folder of masks of what neither trains nor is filled, all.png for every view; "none": there are '
+        "none; None: the folder `ignore`, if there is one",
+        json_schema_extra=UNKEYED,
+    )
     train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
     test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
     clean: list[str] = Field([], description="training views in which the object is absent")
@@ -99,7 +105,7 @@ class SceneKeys(Settings):
         json_schema_extra=UNKEYED,
     )
 
-    _slashes = field_validator("images", "masks", "test_masks", "gaussians", "cleaned", "fill")(to_slashes)
+    _slashes = field_validator("images", "masks", "test_masks", "ignore", "gaussians", "cleaned", "fill")(to_slashes)
 
     @property
     def has_masks(self) -> bool:

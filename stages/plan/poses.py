@@ -10,6 +10,7 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.roles import capture_views, describe_split
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.capture.undistort import check_ignored
 from reffusion.io.annotations import file_of
 from reffusion.io.images import ENDINGS, image_size
 from reffusion.params.clicks import CLICKS
@@ -46,6 +47,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     read = shown | brought | set(capture.depth_maps)
     masks = {file_of(path) for files in roles.mask_files.values() for path in files.values()}
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
+    read |= {file_of(path) for paths in roles.ignore.values() for path in paths}
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED and path not in masks})
 
 
@@ -69,7 +71,9 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     width, height = capture_views(capture, roles).size_of(next(iter(capture.pictures)))
     reduced = min(1.0, params.longest / max(width, height))
     megapixels = round(width * height * reduced**2 / 1e6, 6)
-    return {"views": views, "brings_poses": capture.poses is not None, "megapixels": megapixels}
+    ignored = {name: [path.relative_to(scene).as_posix() for path in paths] for name, paths in roles.ignore.items()}
+    facts = {"ignore": ignored} if ignored else {}
+    return facts | {"views": views, "brings_poses": capture.poses is not None, "megapixels": megapixels}
 
 
 def preview(params: Params, scene: Path) -> list[str]:
@@ -88,9 +92,11 @@ def preview(params: Params, scene: Path) -> list[str]:
         who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
         return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
     capture, roles = read_scene(params, scene, params.longest)
+    check_ignored(roles.ignore)
     given = load_reference_files(scene, capture_views(capture, roles), params.reference)
     notes = [describe_split(len(roles.train), len(roles.test))]
     notes += [f"{len(roles.camera_only)} views are camera-only"] if roles.camera_only else []
+    notes += [f"parts of {len(roles.ignore)} photographs are ignored"] if roles.ignore else []
     notes += _describe_poses(capture, scene)
     notes += _describe_reduced_pictures(capture, params.longest)
     notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []

@@ -13,6 +13,7 @@ from reffusion.io.images import load_thumbnail, open_image
 
 PROJECTION = re.compile(rb"GPano:ProjectionType\W+(equirectangular|cylindrical)")  # in the XMP data of a picture
 LOOKED_AT = 8  # largest number of pictures whose borders are compared
+IMAGE_FOLDERS = ("images", "photos", "input", "rgb", ".")  # usual folders of pictures without poses
 SIDE = 512  # px, width of the reduced pictures
 # The left and the right border of a panorama are neighbors. They may differ by this many times the difference of other
 # neighboring columns.
@@ -20,13 +21,14 @@ ALIKE = 2.0
 LEAST_CONTRAST = 6.0  # levels of 255: standard deviation along the borders, below which they are not compared
 
 
-def refuse_panoramas(pictures: Mapping[str, Path]) -> None:
+def refuse_panoramas(scene: Path, pictures: Mapping[str, Path]) -> None:
     """Raise BadInput if pictures are panoramas, by their metadata (GPano) or by what they show.
 
     Without metadata, pictures are panoramas if they are exactly twice as wide as high and in most of them the left and
     the right border show the same.
 
     Args:
+        scene: the scene's folder, for the message.
         pictures: view name -> picture file.
     """
     heads = {name: _read_head(path) for name, path in pictures.items()}
@@ -38,7 +40,8 @@ def refuse_panoramas(pictures: Mapping[str, Path]) -> None:
     if found:
         raise BadInput(
             f"{next(iter(pictures.values())).parent}: {len(found)} of {len(pictures)} pictures are 360-degree "
-            f"panoramas ({', '.join(found[:3])}{', ...' if len(found) > 3 else ''}); cut them into perspective pictures"
+            f"panoramas ({', '.join(found[:3])}{', ...' if len(found) > 3 else ''}); cut them into perspective views: "
+            f"`reffusion panoramas {scene}`"
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, find_image_folder, find_pictures, has_pictures, relative_paths
-from reffusion.capture.layouts.panoramas import refuse_panoramas
+from reffusion.capture.layouts.panoramas import IMAGE_FOLDERS, refuse_panoramas
 from reffusion.io.images import image_size
 
 
@@ -21,11 +21,11 @@ def read(folder: Path, images: str | None, references: frozenset[Path] = frozens
     Raises:
         BadInput: there are no pictures, two share a view name, or one is unreadable or a panorama.
     """
-    image_folder = find_image_folder(folder, images, ("images", "photos", "input", "rgb", "."))
+    image_folder = find_image_folder(folder, images, IMAGE_FOLDERS)
     found = find_pictures(image_folder, nested=not has_pictures(image_folder))
     pictures = {name: path for name, path in found.items() if path not in references}
     for path in pictures.values():
         image_size(path)  # raises BadInput for an unreadable picture now, before long computations
-    refuse_panoramas(pictures)
+    refuse_panoramas(folder, pictures)
     paths = relative_paths(image_folder, pictures)
     return Capture("photos", pictures, paths, None, None, image_folder, (), upright=True)
