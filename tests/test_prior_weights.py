@@ -15,8 +15,6 @@ from reffusion.seeding import generator
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 SIDE = 32  # px
 SAMPLES = 200
-# The shipped text encoder has collapsed; the training that mends it (`priors/tiny/train.py`) is not finished.
-pytestmark = pytest.mark.xfail(reason="the shipped weights are deaf: see the model card", strict=True)
 DRAWS = 8  # of noise and timesteps for each sample, over which its loss is averaged
 
 
@@ -35,8 +33,19 @@ def pictures():
     return pixels[named], masks[named], [captions[index] for index in named], wrong
 
 
+@pytest.mark.xfail(reason="a whole view and a crop look too alike to these weights: see the model card", strict=True)
 def test_the_papers_two_prompts_change_the_prediction(pictures):
     """The change is at least 1 % of the rms of the prediction, in the mean over the noise levels."""
+    assert measure_change_by_prompts(pictures) > 0.01
+
+
+def test_a_collapsed_text_encoder_would_be_noticed(pictures):
+    """The weights before changed their predictions by 1e-6."""
+    assert measure_change_by_prompts(pictures) > 0.003
+
+
+def measure_change_by_prompts(pictures) -> float:
+    """Return the rms by which the paper's two prompts change predictions, relative to the rms of a prediction."""
     prior, (pixels, masks, *_) = load_prior(TINY), pictures
     pixels, masks = pixels[:16], masks[:16]
     text = diffusion.embed_text(prior, Prompts().texts)
@@ -48,7 +57,7 @@ def test_the_papers_two_prompts_change_the_prediction(pictures):
         whole, crop = (
             diffusion.raw_prediction(prior, noisy, t, condition, words.expand(16, -1, -1)) for words in text[:2, None]
         )
-    assert (whole - crop).square().mean().sqrt() > 0.01 * whole.square().mean().sqrt()
+    return float((whole - crop).square().mean().sqrt() / whole.square().mean().sqrt())
 
 
 def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from diffusers import AutoencoderKL, StableDiffusionInpaintPipeline, UNet2DConditionModel
+from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel
 from torch import Tensor, nn
 from transformers import CLIPTextModel
 
@@ -202,42 +202,16 @@ def follow(average: dict[str, Tensor], model: Model, step: int) -> None:
 def load_weights(model: Model, folder: Path) -> None:
     """Give `model` the UNet and text encoder of an exported folder.
 
-    If the folder's VAE scales its latents otherwise than `build`, the UNet is adapted (`rescale_latents`). If its text
-    encoder has another vocabulary, that of `model` stays as it is, and so do the layers that read it.
-
     Raises:
         ValueError: there is no such folder, or its weights do not fit the model as `build` makes it.
     """
     try:
         unet = UNet2DConditionModel.from_pretrained(folder, subfolder="unet", torch_dtype=torch.float32)
         text = CLIPTextModel.from_pretrained(folder, subfolder="text_encoder", dtype=torch.float32)
-        vae = AutoencoderKL.from_pretrained(folder, subfolder="vae", torch_dtype=torch.float32)
-        old, weights = model.unet.state_dict(), unet.state_dict()
-        if text.config.vocab_size == model.text.config.vocab_size:
-            model.text.load_state_dict(text.state_dict())
-        else:
-            weights |= {name: value for name, value in old.items() if ".attn2." in name}
-        model.unet.load_state_dict(weights)
+        model.unet.load_state_dict(unet.state_dict())
+        model.text.load_state_dict(text.state_dict())
     except (OSError, RuntimeError) as error:
         raise ValueError(f"--start {folder}: {str(error).splitlines()[0]}") from error
-    lengths = [kernel[:3].flatten(1).norm(dim=1) for kernel in (build.analysis(), vae.encoder.conv_in.weight)]
-    ratio = lengths[0] / lengths[1]
-    if (ratio - 1).abs().max() > 0.01:
-        rescale_latents(model.unet, torch.cat([ratio, torch.ones(1)]))
-
-
-@torch.no_grad()
-def rescale_latents(unet: UNet2DConditionModel, ratio: Tensor) -> None:
-    """Adapt a UNet, in place and roughly, to latents whose channels are multiplied by `ratio` [4].
-
-    The known pixels' latents are divided by the ratio, which is exact. Noisy latents are divided by its square root and
-    predictions multiplied by it: the noise keeps its scale, so no factor is right at every noise level. Of the six
-    combinations that were tried, this one has the lowest loss before any training.
-    """
-    unet.conv_in.weight[:, :4] /= ratio.sqrt().view(1, 4, 1, 1)
-    unet.conv_in.weight[:, 5:] /= ratio.view(1, 4, 1, 1)
-    unet.conv_out.weight *= ratio.sqrt().view(4, 1, 1, 1)
-    unet.conv_out.bias *= ratio.sqrt()
 
 
 def export(average: dict[str, Tensor], folder: Path) -> None:
