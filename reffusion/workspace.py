@@ -127,7 +127,7 @@ class Workspace:
     @cached_property
     def ignored(self) -> dict[str, np.ndarray]:
         """Pixels of photographs that neither train nor are filled (`load_ignored`)."""
-        return load_ignored(self.poses, [self.scene.cameras[name] for name in self.scene.train])
+        return load_ignored(self.poses, self.scene.train)
 
     def remove_object(self, name: str) -> np.ndarray:
         """Return a view without the object, uint8 [H, W, 3].

@@ -53,7 +53,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     held_out_names = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out_names]
     images = load_views(poses, scene.train)
-    hidden = load_ignored(poses, [scene.cameras[name] for name in scene.train])
+    hidden = load_ignored(poses, scene.train)
     if params.pixels == "unmasked":
         assert raw_masks is not None
         masks = load_hidden_pixels(raw_masks, scene)

@@ -79,7 +79,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
-    ignored = load_ignored(poses, train)
+    ignored = load_ignored(poses, scene.train)
     ballots = {name: raw[name] for name in scene.train if name in raw}
     ballots |= {name: empty[name] for name in scene.clean} if raw else {}
     labels = (

@@ -569,7 +569,8 @@ def test_panoramas_are_refused_by_their_borders(tmp_path):
     for k in range(5):
         Image.fromarray(panorama(0.7 * k)).save(tmp_path / f"images/p{k}.png")
     message = (
-        r"images: 5 of 5 pictures are 360-degree panoramas \(p0, p1, p2, ...\); cut them into perspective pictures"
+        r"images: 5 of 5 pictures are 360-degree panoramas \(p0, p1, p2, ...\); cut them into perspective views: "
+        r"`reffusion panoramas"
     )
     with pytest.raises(BadInput, match=message):
         load_capture(tmp_path)

@@ -198,9 +198,10 @@ def test_report_reads_through_io(path):
     app = (*page, *drawing_names, "reffusion.fit.exposure") if path.parent.name == "app" else ()
     painting = ("reffusion.inpaint", "reffusion.prior", "reffusion.params", "reffusion.weights", "reffusion.command")
     tried = painting if path.stem == "doctor" else ()  # to let each inpainter paint
+    cutting = ("reffusion.capture", "reffusion.command") if path.stem == "panoramas" else ()  # to make views
     # For the random order of pairs, and for confidence intervals.
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()
-    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app, *tried)) for name in own), (
+    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app, *tried, *cutting)) for name in own), (
         own
     )
 

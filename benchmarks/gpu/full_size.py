@@ -121,8 +121,9 @@ def shrink(shape: Shape) -> Shape:
         unet |= {"projection_class_embeddings_input_dim": 32 + 6 * 8}
     vae = {"block_out_channels": (16, 16), "layers_per_block": 1, "norm_num_groups": 8, "sample_size": 32}
     vae |= {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
-    small = {"intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2, "vocab_size": 527}
-    small |= {"max_position_embeddings": 24, "bos_token_id": 525, "eos_token_id": 526}
+    small = {"intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    tiny = json.loads((TINY / "text_encoder/config.json").read_text())  # whose tokenizer the small models share
+    small |= {key: tiny[key] for key in ("vocab_size", "max_position_embeddings", "bos_token_id", "eos_token_id")}
     widths = (64, 32) if second else (64,)
     texts = tuple(t | small | {"hidden_size": w, "projection_dim": w} for t, w in zip(shape.texts, widths, strict=True))
     return Shape(unet, shape.vae | vae, texts)

@@ -128,7 +128,7 @@ FILLING = {
     "sharp steps of depth": Switch(
         "initialize",
         replaced={INITIALIZE + "fill.sharpen_steps": lambda depth, *_: depth},
-        files=("depth/steps.py",),
+        files=("depth/discontinuities.py",),
     ),
     "overlap": Switch("initialize", {"initialize.overlap": 0.0}),
     "tidy filling": Switch("initialize", {"initialize.tidy": False}),

@@ -238,8 +238,7 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
     names = list(names)
     photographed = [name for name in names if has_photograph(poses, name)]
     photos = {name: normalize_exposure(image, fit, name) for name, image in load_views(poses, photographed).items()}
-    cameras = load_scene(poses).cameras
-    ignored = {name: each for name, each in load_ignored(poses, map(cameras.__getitem__, photos)).items() if each.any()}
+    ignored = {name: each for name, each in load_ignored(poses, photos).items() if each.any()}
     renderings = render_views(poses, fit, [name for name in names if name not in photos or name in ignored])
     mixed = {name: np.where(each[..., None], renderings[name], photos[name]) for name, each in ignored.items()}
     return {name: (renderings | photos | mixed)[name] for name in names}

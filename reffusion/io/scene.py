@@ -90,20 +90,14 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
-def load_ignored(poses_dir: Path, cameras: Iterable[Camera]) -> dict[str, np.ndarray]:
-    """Read which pixels of photographs are ignored, as a dict view name -> bool [H, W].
+def load_ignored(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Read which pixels of the named views are ignored, as a dict view name -> bool [H, W].
 
-    They show what passes by or what moves with the camera: they neither train nor are filled. The dict is empty if the
-    scene ignores nothing; else every view has an entry.
+    They show what passes by or what moves with the camera: they neither train nor are filled. A view that ignores
+    nothing has no entry.
     """
-    cameras, folder = list(cameras), Path(poses_dir) / IGNORED
-    if not folder.is_dir():
-        return {}
-    return {
-        each.name: load_mask(path) if (path := folder / f"{each.name}.png").is_file() else np.zeros(size, bool)
-        for each in cameras
-        for size in [(each.height, each.width)]
-    }
+    files = {name: Path(poses_dir) / IGNORED / f"{name}.png" for name in names}
+    return {name: load_mask(file) for name, file in files.items() if file.is_file()}
 
 
 def has_photograph(poses_dir: Path, name: str) -> bool:
