@@ -58,6 +58,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
         assert raw_masks is not None
         masks = load_hidden_pixels(raw_masks, scene)
         hidden |= {name: mask | hidden.get(name, mask) for name, mask in masks.items()}
+    if hidden:
+        hidden = {name: hidden.get(name, np.zeros(image.shape[:2], bool)) for name, image in images.items()}
     # Masked pixels are inpainted (Telea), because optical flow reads them although they do not supervise.
     images |= {name: classical.telea(images[name], mask) for name, mask in hidden.items()}
     gains = estimate_exposures(params, scene, cameras, images)

@@ -1,23 +1,17 @@
-"""The stage `masks`: raw masks vote on which Gaussians are the object, and the pixels of every view are classified.
-
-The labelled Gaussians are rendered into each view, which gives its consistent mask C. Pixels of C behind which no other
-photograph shows the background are unobserved (U). Pixels to be invented are the invent mask I, see
-`reffusion.types.MaskSet`.
-"""
+"""The stage `masks`: raw masks vote on which Gaussians are the object, and the pixels of every view are classified."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.background.model import Background, surfaces_to_arrays
-from reffusion.background.visibility import render_depth_views
+from reffusion.background.model import surfaces_to_arrays
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.scene_masks import masks_from_clicks, refine_masks
 from reffusion.fit import exposure
@@ -32,14 +26,12 @@ from reffusion.io.scene import (
     load_raw_masks,
     load_scene,
     load_views,
-    load_warnings,
     save_mask_sets,
 )  # fmt: skip
 from reffusion.masks import consolidation, provided_gaussians, voting
-from reffusion.masks.debris import find_debris
+from reffusion.masks.classification import Classification, ObjectMarks, classify_scene
 from reffusion.masks.regions import FillRequest, Region
-from reffusion.masks.remnants import Remnant, find_remnants
-from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
+from reffusion.masks.remnants import Remnant
 from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, Scene
 from reffusion.workspace import SURFACES
@@ -70,143 +62,66 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         ValueError: nothing says what is to be changed, or the Gaussians that the scene brings do not fit its cameras.
     """
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
-    train = [scene.cameras[name] for name in scene.train]
-    check_frame(poses, fit, gaussians, train)
-    region, (deleted, scattered) = load_region(raw_masks), load_deleted(poses, params.device)
-    raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
-    fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
-    if deleted is None and not raw and region is None and not fill.masks and not scene.camera_only:
-        raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
+    check_frame(poses, fit, gaussians, [scene.cameras[name] for name in scene.train])
+    marks = load_marks(params, scene, gaussians, poses, raw_masks)
+    load_photos = lambda: exposure.load_normalized_views(poses, fit, scene.train)
+    found = classify_scene(params, scene, gaussians, marks, load_photos)
+    messages = [*report_remnants(found.remnants, out, poses), *found.warnings]
+    for line in messages:
+        warnings.warn(line, stacklevel=1)
+    if messages:
+        save_json(out / WARNINGS, messages)
+    save_labels(out / "debris.npy", found.debris.cpu())
+    save_labels(out / "labels.npy", found.labels.cpu())
+    save_arrays(out / SURFACES, collect_surfaces(found))
+    save_mask_sets(out, found.sets)
+    save_json(out / "facts.json", summarize(params, scene, marks, found, list_objects(raw_masks)))
 
-    empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
-    ignored = load_ignored(poses, scene.train)
-    ballots = {name: raw[name] for name in scene.train if name in raw}
-    ballots |= {name: empty[name] for name in scene.clean} if raw else {}
-    labels = (
-        deleted
-        if deleted is not None
-        else consolidation.label_object(params, gaussians, train, ballots, ignored, region)
-    )
-    photo_of = lambda name: load_views(poses, [name])[name]
-    labels, consistent, remnants = complete_object(params, scene, gaussians, labels, out, photo_of, bool(raw))
-    if deleted is not None:
-        labels = deleted | limit_extras(labels & ~deleted, deleted, "inside", out)
-    hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
-    hidden |= {name: hidden[name] | mask for name, mask in ignored.items()}
 
-    background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
-    needs_surfaces = params.shadows or consolidation.needs_unobserved(params, fill)
-    if needs_surfaces:
-        background = background.with_planes(gaussians, labels)
-    if background.planes or params.debris:
-        background = replace(background, photos=exposure.load_normalized_views(poses, fit, scene.train))
-    shadow = find_shadow(params, background, gaussians.means[labels], scene)
-    debris = torch.zeros_like(labels) if scattered is None else scattered
-    if params.debris and (raw or deleted is not None):
-        found = find_debris(gaussians, labels, background.views, hidden, background.photos) & ~debris
-        debris = debris | (found if deleted is None else limit_extras(found, deleted, "behind", out))
-    save_labels(out / "debris.npy", debris.cpu())
-    labels = labels | debris
-    remaining = gaussians.map(lambda p: p[~labels])
-    if needs_surfaces:
-        background = background.with_mirrors(remaining)
+def collect_surfaces(found: Classification) -> dict[str, np.ndarray]:
+    """Return planes, mirrors and shadow as named arrays; none of the planes if the classes do not depend on them."""
+    surfaces = surfaces_to_arrays(found.background) if found.has_surfaces else {}
+    return surfaces | (found.shadow.to_arrays() if found.shadow else {})
 
-    sets = consolidation.classify_pixels(params, scene, remaining, raw, consistent, background, fill)
-    sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
+
+def summarize(
+    params: Params, scene: Scene, marks: ObjectMarks, found: Classification, objects: Sequence[str]
+) -> dict[str, Any]:
+    """Return the contents of facts.json.
+
+    Args:
+        objects: names of the objects that have masks of their own.
+    """
     repainted = (*scene.train, *scene.camera_only)
-    share = consolidation.unobserved_share(sets, repainted)
-    sets = consolidation.drop_negligible(params, sets, repainted, fill)
-    save_labels(out / "labels.npy", labels.cpu())
-    surfaces = surfaces_to_arrays(background) if needs_surfaces else {}
-    save_arrays(out / SURFACES, surfaces | (shadow.to_arrays() if shadow else {}))
-    save_mask_sets(out, sets)
-    invent = {name: each.invent for name, each in sets.items()}
-    facts = {
-        "kept": [name for name in list_objects(raw_masks) if params.remove is not None and name not in params.remove],
-        "masked_gaussians": int(labels.sum()),
-        "gaussians": len(gaussians),
-        "voting_views": len(ballots),
-        "invent_pixels": consolidation.count_pixels("invent", sets, repainted),
-        "consistent_pixels": consolidation.count_pixels("consistent", sets, repainted),
-        "unobserved_share": share,
+    invent = {name: each.invent for name, each in found.sets.items()}
+    region, shadow = marks.region, found.shadow
+    return {
+        "kept": [name for name in objects if params.remove is not None and name not in params.remove],
+        "masked_gaussians": int(found.labels.sum()),
+        "gaussians": len(found.labels),
+        "voting_views": found.voting_views,
+        "invent_pixels": consolidation.count_pixels("invent", found.sets, repainted),
+        "consistent_pixels": consolidation.count_pixels("consistent", found.sets, repainted),
+        "unobserved_share": found.unobserved_share,
         "invent_views": [name for name in repainted if invent[name].any()],
         "best_reference": voting.best_view(invent, scene.train),
-        "remnants": [{"removed": each.would_float, "share": each.share, "view": each.view} for each in remnants],
+        "remnants": [{"removed": each.would_float, "share": each.share, "view": each.view} for each in found.remnants],
         "shadow": shadow and float(1 - np.exp(shadow.log_light.min())),
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
-    save_json(out / "facts.json", facts)
 
 
-def complete_object(
-    params: Params,
-    scene: Scene,
-    gaussians: Gaussians,
-    labels: Tensor,
-    out: Path,
-    photo_of: Callable[[str], np.ndarray],
-    has_masks: bool,
-) -> tuple[Tensor, dict[str, np.ndarray], list[Remnant]]:
-    """Extend the labels of an object by what can only belong to it, and by remnants that would float in the air.
-
-    A Gaussian whose center lies inside C in (almost) every view can only belong to the object, whatever its votes.
-    Remnants are reported.
+def report_remnants(remnants: Sequence[Remnant], out: Path, poses: Path) -> list[str]:
+    """Draw each remnant, a part of the object that the masks leave out, as remnants/<number>.png; return warnings.
 
     Args:
-        labels: bool [N], the Gaussians that won the vote.
+        remnants: the parts. Of those that would float in the air, the text says that they are removed.
         out: folder of this stage.
-        photo_of: view name -> uint8 [H, W, 3].
-        has_masks: whether the scene brings masks, which alone can leave out parts.
-
-    Returns:
-        The labels, bool [N]; the consistent mask C of every view, view name -> bool [H, W]; and all remnants.
-    """
-    train = [scene.cameras[name] for name in scene.train]
-    consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
-    dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
-    labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
-    if not (params.remnants and has_masks):
-        return labels, consistent, []
-    remnants = find_remnants(gaussians, labels, [camera for camera in train if camera.name in dirty])
-    report_remnants(remnants, out, photo_of)
-    for remnant in (each for each in remnants if each.would_float):
-        labels = labels | torch.as_tensor(remnant.members, device=labels.device)
-        consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
-    return labels, consistent, remnants
-
-
-def find_shadow(params: Params, background: Background, object_means: Tensor, scene: Scene) -> SoftShadow | None:
-    """Find the object's soft shadow, which no mask contains, and print a line if there is one.
-
-    Args:
-        background: with the photographs and the planes around the object.
-        object_means: [N, 3], the centers of the object's Gaussians.
-        scene: names the views that were photographed without the object, and so without its shadow.
-    """
-    if not params.shadows or not background.planes:
-        return None
-    with_object = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
-    shadow = find_soft_shadow(replace(background, photos=with_object), object_means)
-    if shadow:
-        darkest = 1 - np.exp(shadow.log_light.min())
-        print(f"the object's shadow, up to {darkest:.0%} darker, is removed (masks.shadows=false keeps it)", flush=True)
-    return shadow
-
-
-def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[str], np.ndarray]) -> None:
-    """Warn of remnants, the parts of the object that the masks leave out, and draw each as remnants/<number>.png.
-
-    The warnings are also written to warnings.json.
-
-    Args:
-        remnants: the parts. Of those that would float in the air, the text says that they are removed; the caller
-            removes them.
-        out: folder of this stage.
-        photo_of: view name -> uint8 [H, W, 3].
+        poses: folder of the stage `poses`, which holds the photographs.
     """
     described: dict[bool, list[str]] = {True: [], False: []}  # would float -> texts
     for k, remnant in enumerate(remnants, start=1):
-        photo, picture = photo_of(remnant.view).copy(), f"remnants/{k}.png"
+        photo, picture = load_views(poses, [remnant.view])[remnant.view].copy(), f"remnants/{k}.png"
         photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
         save_image(out / picture, photo)
         described[remnant.would_float].append(f"{remnant.describe()}, see masks/{picture}")
@@ -215,11 +130,25 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
         "them: `--set masks.remnants=false`)",
         False: "parts of the object seem to be left; if so, mark them in these views and run again",
     }
-    lines = [f"{outcomes[floats]}: {'; '.join(texts)}" for floats, texts in described.items() if texts]
-    for line in lines:
-        warnings.warn(line, stacklevel=1)
-    if lines:
-        save_json(out / WARNINGS, lines)
+    return [f"{outcomes[floats]}: {'; '.join(texts)}" for floats, texts in described.items() if texts]
+
+
+def load_marks(params: Params, scene: Scene, gaussians: Gaussians, poses: Path, raw_masks: Path) -> ObjectMarks:
+    """Load what says which pixels and Gaussians are the object.
+
+    Args:
+        poses, raw_masks: folders of the stages of these names.
+
+    Raises:
+        ValueError: nothing says what is to be changed.
+    """
+    region, (deleted, scattered) = load_region(raw_masks), load_deleted(poses, params.device)
+    raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
+    fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
+    if deleted is None and not raw and region is None and not fill.masks and not scene.camera_only:
+        raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
+    ignored = load_ignored(poses, scene.train)
+    return ObjectMarks(raw, region, fill, ignored, deleted, scattered)
 
 
 def load_region(raw_masks: Path) -> Region | None:
@@ -245,30 +174,6 @@ def load_deleted(poses: Path, device: str) -> tuple[Tensor | None, Tensor | None
     deleted, path = load_labels(poses / "deleted.npy").to(device), poses / "scattered.npy"
     scattered = load_labels(path).to(device) if path.exists() else torch.zeros_like(deleted)
     return deleted & ~scattered, scattered
-
-
-def limit_extras(extras: Tensor, deleted: Tensor, where: str, out: Path) -> Tensor:
-    """Return the Gaussians to remove besides those that a user deleted in an editor, or none if they outnumber these.
-
-    An object may hide some Gaussians, which an editor does not show. If they outnumber the object's own, the hole is
-    probably no object's, and what the user left in the scene stays. A warning then goes to warnings.json.
-
-    Args:
-        extras: bool [N], True for Gaussians to remove that the user did not delete.
-        deleted: bool [N], True for Gaussians that the user deleted.
-        where: where the extras are, "inside" or "behind" the hole, for the warning.
-        out: folder of this stage.
-    """
-    if (count := int(extras.sum())) <= int(deleted.sum()):
-        return extras
-    lines = [
-        *load_warnings(out),
-        f"{count} splats {where} the hole stay, because they are more than the {int(deleted.sum())} that were deleted "
-        "there; if they belong to the object, delete them too",
-    ]
-    warnings.warn(lines[-1], stacklevel=1)
-    save_json(out / WARNINGS, lines)
-    return torch.zeros_like(extras)
 
 
 def collect_raw_masks(

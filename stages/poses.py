@@ -6,50 +6,41 @@ A role says whether a view is a training or a test view, clean (without the obje
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import cameras_around_hole, flow, image_detail, normalized_frame, sfm
+from reffusion.capture import cameras_around_hole, normalized_frame, sfm
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.agreement import judge_poses
-from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undistortion_map
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.refine import refine_cameras
+from reffusion.capture.own_splats import OwnSplats, load_own_splats
+from reffusion.capture.preparation import LEAST_POINTS, MORE_POINTS, SEED, adjust_views, choose_size
 from reffusion.capture.roles import Roles
-from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import (
     describe_transparency,
     fitting_size,
-    load_resized,
     resized_lens,
     save_ignored_pixels,
     save_undistorted_view,
 )
-from reffusion.capture.views import check_outliers
-from reffusion.gaussians import matching
-from reffusion.gaussians.movement import Cloud, Movement
 from reffusion.io.arrays import save_json, save_labels
-from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
-from reffusion.io.ply import load_property_names, save_ply
+from reffusion.io.ply import save_ply
 from reffusion.io.scene import WARNINGS, load_views, save_scene
-from reffusion.io.splat_rows import Rows, rotate_rows
-from reffusion.io.splats import Splats, load_splats
+from reffusion.io.splats import Splats
 from reffusion.params.poses import Params
-from reffusion.params.reference import reference_list
 from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
-LEAST_POINTS = 100  # with fewer sparse points, some from optical flow are added
-MORE_POINTS = 10_000  # largest number of added points; if flow finds too few, random points are added
-SEED = 0
 SFM_FACTS = "sfm.json"  # file with the `facts` of `sfm.Reconstruction`
 
 
@@ -78,7 +69,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     Raises:
         BadInput: the scene cannot be used; the message names the file and the remedy.
     """
-    own_splats = _load_own_splats(params, scene)  # first, so that errors in these files are found before the work
+    own_splats = load_own_splats(params, scene)  # first, so that errors in these files are found before the work
     if is_gaussians_only(params, scene):
         assert own_splats is not None  # a scene without photographs has `cleaned`, which requires `gaussians`
         _save_gaussians_only(params, out, scene, own_splats)
@@ -99,7 +90,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         if lost := [name for name in everyone if name not in capture.pictures]:
             messages.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
         roles = roles.restrict(set(capture.pictures))
-    views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
+    views, longest = sorted({*roles.train, *roles.test}), choose_size(params, capture, roles)
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
         lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
@@ -108,7 +99,10 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         lenses[name], pinholes[name] = resized_lens(name, capture, longest)
     assert capture.poses is not None
     normalized = normalized_frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    normalized, contradictions = _drop_outliers(params, roles, replace(normalized, camera_only=roles.camera_only), out)
+    normalized = replace(normalized, camera_only=roles.camera_only)
+    normalized, contradictions, residuals = adjust_views(params, roles, normalized, partial(load_views, out))
+    if residuals:
+        save_json(out / "refine.json", residuals)
     views = [name for name in views if name in normalized.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
@@ -124,102 +118,6 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     save_scene(out, normalized)
     if own_splats is not None:
         _save_own_splats(out, normalized, own_splats)
-
-
-@dataclass(frozen=True)
-class Edit:
-    """What a user did to the N Gaussians of a scene in an editor.
-
-    Attributes:
-        deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names, but for
-            those that were cropped.
-        scattered: bool [N], True for deleted Gaussians that leave no hole to fill: they stood alone, or were filtered.
-        cropped: bool [N], True for Gaussians that were deleted around what stays.
-        movement: takes the scene to the place that it has in the file.
-        added: Gaussians that only the file has, in the scene's own frame; None without any.
-    """
-
-    deleted: np.ndarray
-    scattered: np.ndarray
-    cropped: np.ndarray
-    movement: Movement
-    added: Rows | None
-
-
-@dataclass(frozen=True)
-class OwnSplats:
-    """The N Gaussians that a scene brings.
-
-    Attributes:
-        splats: the Gaussians in the scene's own frame.
-        properties: names of the properties of the .ply, in order; empty for other formats.
-        edit: what the user did to them; None if the scene has no file that says so.
-        notes: sentences about both files, for the user.
-    """
-
-    splats: Splats
-    properties: tuple[str, ...]
-    edit: Edit | None
-    notes: tuple[str, ...]
-
-
-def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
-    """Load the scene's own Gaussians and find the deleted ones; None without any; raises BadInput for unusable ones."""
-    check_gaussian_files(params, scene)
-    if params.gaussians is None:
-        return None
-    path = scene / params.gaussians
-    splats, edit = load_splats(path), None
-    notes = [f"{path.name}: {note}" for note in splats.notes]
-    if params.cleaned is not None:
-        cleaned = load_splats(scene / params.cleaned)
-        notes += [f"{params.cleaned}: {note}" for note in cleaned.notes]
-        edit = _find_edit((path, scene / params.cleaned), splats.rows, cleaned.rows)
-    return OwnSplats(splats, load_property_names(path), edit, tuple(notes))
-
-
-def _describe_looks(rows: Rows) -> Cloud:
-    """Return what is known of Gaussians to recognize them."""
-    opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))
-    return Cloud(rows.means, rows.log_scales, 0.5 + SH0 * rows.sh[:, 0], opacities)
-
-
-def _find_edit(files: tuple[Path, Path], whole: Rows, cleaned: Rows) -> Edit:
-    """Find what was done to the Gaussians of the whole scene; raises BadInput if it is unclear or leaves no hole."""
-    cloud = _describe_looks(whole)
-    match = matching.match_gaussians(cloud, _describe_looks(cleaned))
-    if match.movement is None:
-        raise BadInput(
-            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one, and too few look like "
-            "one: it is another scene, or was decimated, recolored or stretched; only delete, crop, move, turn, scale"
-        )
-    if match.movement.mirrors:
-        raise BadInput(f"{files[1]}: it is {files[0].name} mirrored; save it again without mirroring")
-    if not match.deleted.any():
-        raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
-    filtered = matching.find_filtered(cloud.opacities, match.deleted)
-    regions = matching.find_regions(whole.means, match.deleted & ~filtered)
-    cropped = matching.find_cropped(whole.means, match.deleted, regions)
-    scattered = match.deleted & ((regions < 0) | filtered)
-    deleted = match.deleted & ~cropped
-    count, alone, around = (int(np.count_nonzero(each)) for each in (match.deleted, scattered, cropped))
-    crop = f", {around} of them around what stays: cropped, and not filled" if around else ""
-    if alone + around == count:
-        raise BadInput(
-            f"{files[1]}: {alone} scattered splats were deleted{crop}; no region to fill: each stood among splats that "
-            f"stay. Delete a whole object, or use {files[1].name} as it is"
-        )
-    dust = f", {alone} of them scattered: they leave no region to fill" if alone else ""
-    moved = "" if match.movement.is_still else f", and it was {match.movement.describe()}"
-    new = np.flatnonzero(match.places < 0)
-    more = f", and {len(new)} of its splats are new: they stay" if len(new) else ""
-    print(f"{files[1].name}: {count} of {len(whole)} splats were deleted{dust}{crop}{moved}{more}", flush=True)
-    if not len(new):
-        return Edit(deleted, scattered, cropped, match.movement, None)
-    turned = rotate_rows(cleaned.take(new), match.movement.rotation.T)
-    sizes = turned.log_scales - np.float32(np.log(match.movement.scale))
-    added = replace(turned, means=match.movement.invert(cleaned.means[new]), log_scales=sizes)
-    return Edit(deleted, scattered, cropped, match.movement, added)
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
@@ -266,30 +164,6 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
     _save_own_splats(out, placed, own_splats)
 
 
-def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
-    """Return the scene without views that contradict their poses, cameras adjusted, and sentences about these views."""
-    # The check compares views at shared points. A scene with too few sparse points gets points from optical flow first.
-    connected = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
-    shown = [camera for name, camera in connected.cameras.items() if name not in connected.camera_only]
-    check = check_poses(shown, connected.points, lambda name: load_views(out, [name])[name])
-    verdict = judge(check, connected, roles.keep, params.exclude)
-    # Raises BadInput if scene.yaml uses a view that is left out, e.g. for a reference.
-    check_outliers("reference", [each.view for each in reference_list(params.reference)], verdict.outliers)
-    check_outliers("clicks", params.clicks or (), verdict.outliers)
-    if params.region is not None and params.region.view is not None:
-        check_outliers("region", [params.region.view], verdict.outliers)
-    if verdict.outliers or connected is scene:
-        connected = _adjust_cameras(params, verdict.apply(scene), out)
-    return replace(connected, suspects=verdict.suspects), list(verdict.sentences)
-
-
-def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
-    """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points."""
-    if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
-        scene = _refine_cameras(scene, out)
-    return scene if len(scene.points) >= LEAST_POINTS else _add_flow_points(scene, out)
-
-
 def _oddities(scene: Scene, out: Path) -> list[str]:
     """Return sentences about photographs whose exposure is odd."""
     return sanity.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
@@ -302,54 +176,6 @@ def _save_warnings(out: Path, messages: list[str]) -> None:
     # `make check` reads this file. A run in which this stage is cached prints its warnings again.
     if messages:
         save_json(out / WARNINGS, messages)
-
-
-def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
-    """Return the larger image side, px, at which to use the pictures: `params.longest`, or half if that is as sharp."""
-    if params.min_detail == 0:
-        return params.longest
-    # Up to 15 training views are tested. Pictures that are blurred or were enlarged are halved.
-    chosen = roles.train[:: max(1, len(roles.train) // 8)]
-    images = [load_resized(capture.pictures[name], params.longest, capture.upright) for name in chosen]
-    if not image_detail.is_enlarged(images, params.min_detail):
-        return params.longest
-    side = max(max(image.shape[:2]) for image in images)
-    print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
-    return side // 2
-
-
-def _refine_cameras(scene: Scene, out: Path) -> Scene:
-    """Adjust the cameras to optical flow if it shows a need; the residuals, px, are printed and go to refine.json."""
-    # Test views are adjusted too, as in structure from motion.
-    shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.camera_only}
-    found = refine_cameras(list(shown.values()), load_views(out, shown))
-    if np.isnan(found.before):
-        print("cameras as given: optical flow matches nothing between the views", flush=True)
-    elif found.after is None:
-        print(f"cameras as given: the views miss each other by {found.before:.2f} px", flush=True)
-    else:
-        print(f"cameras adjusted: views missed each other by {found.before:.2f} px, now {found.after:.2f}", flush=True)
-    before = None if np.isnan(found.before) else found.before
-    save_json(out / "refine.json", {"before": before, "after": found.after})
-    return replace(scene, cameras=scene.cameras | found.cameras)
-
-
-def _add_flow_points(scene: Scene, out: Path) -> Scene:
-    """Add up to `MORE_POINTS` points, triangulated from optical flow between the training views."""
-    cameras = [scene.cameras[name] for name in scene.train]
-    pixels = sum(camera.width * camera.height for camera in cameras)
-    # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.
-    cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))
-    points, colors = flow.triangulate_points(cameras, load_views(out, scene.train), cell)
-    kept = np.arange(len(points))
-    if len(points) > MORE_POINTS:
-        draws = seeding.generator(SEED, "poses", "flow points")
-        kept = torch.randperm(len(points), generator=draws)[:MORE_POINTS].numpy()
-    return replace(
-        scene,
-        points=np.concatenate([scene.points, points[kept]]),
-        point_colors=np.concatenate([scene.point_colors, colors[kept]]),
-    )
 
 
 def _run_sfm(params: Params, out: Path, capture: Capture, roles: Roles) -> Capture:

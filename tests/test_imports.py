@@ -201,9 +201,9 @@ def test_report_reads_through_io(path):
     cutting = ("reffusion.capture", "reffusion.command") if path.stem == "panoramas" else ()  # to make views
     # For the random order of pairs, and for confidence intervals.
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()
-    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app, *tried, *cutting)) for name in own), (
-        own
-    )
+    assert all(
+        name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app, *tried, *cutting)) for name in own
+    ), own
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)

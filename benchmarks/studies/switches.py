@@ -58,6 +58,11 @@ def no_pieces(target: Any, hole: np.ndarray, *_: Any) -> Assembly:
     return Assembly(target.image, np.zeros_like(hole), 0.0)
 
 
+def keep_shadows(trusted: Any, gaussians: Any, background: Any) -> tuple[Any, Any, dict[str, np.ndarray]]:
+    """Find no shadow; stands for `remove_shadows`."""
+    return trusted, background, {}
+
+
 def paint_by(method: Any) -> Any:
     """Return a function that fills a view by a classical method alone; stands for `complete_view`."""
     return lambda image, hole, camera, hidden, around, seeds: (
@@ -151,7 +156,9 @@ FILLING = {
     ),
     "hard shadows": Switch(
         "initialize",
-        replaced={"stages.initialize.remove_shadows": lambda trusted, gaussians, background: (trusted, background, {})},
+        replaced={
+            INITIALIZE + "filling.remove_shadows": lambda trusted, gaussians, background: (trusted, background, {})
+        },
         files=("initialize/relighting.py",),
     ),
     "extra views": Switch("initialize", {"initialize.extra_views": 0}, files=("initialize/extra_views.py",)),
@@ -165,7 +172,7 @@ FILLING = {
     ),
     "warped references": Switch(
         "initialize",
-        replaced={"stages.initialize.warp_references": lambda *_: []},
+        replaced={INITIALIZE + "filling.warp_references": lambda *_: []},
         files=("initialize/warped_views.py",),
     ),
     "refit": Switch("initialize", {"initialize.refit_steps": 0}, files=("initialize/refit.py",)),

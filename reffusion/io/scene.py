@@ -20,7 +20,7 @@ from reffusion.io.images import load_exr, load_image, load_mask, save_exr, save_
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from reffusion.types import Camera, MaskSet, Reference, Scene
+    from reffusion.types import MaskSet, Reference, Scene
 
 WARNINGS = "warnings.json"  # in the folder of a stage: sentences about what looks wrong in its input
 IGNORED = "ignored"  # in the folder of `poses`: masks of the pixels of a photograph that neither train nor are filled
