@@ -67,14 +67,14 @@ WEIGHTS = {
 # Row of the table in docs/paper.md -> the modules of reffusion/ that do its work in `paper`, of the packages that hold
 # the method. Another module that runs there is a step that the paper does not have, or lacks a row.
 ACTIVE = {
-    "masks.vote": "masks/voting masks/consolidation masks/regions",
+    "masks.vote": "masks/classification masks/voting masks/consolidation masks/regions",
     "masks.invent": "background/model background/visibility",
     "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
-    "reference.candidates": "references/files references/view_ranking depth/inpaint_depth",
+    "reference.candidates": "references/completion references/files references/view_ranking depth/inpaint_depth",
     "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
     "personalize.lora.rank": "prior/lora",
-    "initialize.start": "initialize/draft initialize/draft_steps initialize/fill initialize/unprojection "
-    "initialize/origins",
+    "initialize.start": "initialize/filling initialize/draft initialize/draft_operations initialize/fill "
+    "initialize/unprojection initialize/origins initialize/summary",
     "initialize.depth.model": "depth/monocular depth/estimates depth/alignment depth/background_depth depth/bilateral "
     "depth/completion depth/solverlog",
     "distill.iterations": "distill/inputs distill/loop distill/train_view distill/terms/term distill/overlap_worker",
