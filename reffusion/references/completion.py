@@ -44,17 +44,14 @@ class Candidates:
 
     @classmethod
     def by_score(
-        cls, images: Sequence[np.ndarray], numbers: Sequence[int], choose: int | None, **facts: Any
+        cls,
+        images: Sequence[np.ndarray],
+        numbers: Sequence[int],
+        scores: Sequence[float],
+        choose: int | None,
+        facts: dict[str, Any],
     ) -> Candidates:
-        """Choose the candidate with the lowest score, unless `choose` is the number of another one.
-
-        Args:
-            images: the candidates.
-            numbers: their numbers.
-            choose: number of the candidate to choose; None for the one with the lowest score.
-            facts: first the scores.
-        """
-        scores = next(iter(facts.values()))
+        """Choose the candidate with the lowest score, unless `choose` is the number of another one."""
         index = int(np.argmin(scores)) if choose is None else list(numbers).index(choose)
         return cls(images, numbers[index], images[index], facts)
 
@@ -107,7 +104,7 @@ def _paint_by_patches(params: Params, base: np.ndarray, masks: MaskSet, name: st
     completions = exemplar.complete_view(base, hole, camera, masks.consistent, space.background, seeds)
     found = [next(completions) for _ in trace.progress(len(seeds), "reference")]
     misfits = [each.misfit for each in found]
-    return Candidates.by_score([each.image for each in found], numbers, params.choose, misfits=misfits)
+    return Candidates.by_score([each.image for each in found], numbers, misfits, params.choose, {"misfits": misfits})
 
 
 def _paint_by_prior(params: Params, base: np.ndarray, invent: np.ndarray) -> Candidates:
@@ -126,7 +123,8 @@ def _paint_by_prior(params: Params, base: np.ndarray, invent: np.ndarray) -> Can
             **params.sampler.model_dump(),
         ).cpu()
     seams = inpaint.seam_score(painted, hole).tolist()
-    return Candidates.by_score([inpaint.to_picture(each) for each in painted], numbers, params.choose, seams=seams)
+    images = [inpaint.to_picture(each) for each in painted]
+    return Candidates.by_score(images, numbers, seams, params.choose, {"seams": seams})
 
 
 def _paint_by_seeds(params: Params, base: np.ndarray, masks: MaskSet, folder: Path) -> Candidates:
@@ -140,9 +138,10 @@ def _paint_by_seeds(params: Params, base: np.ndarray, masks: MaskSet, folder: Pa
             paint = paint or load_seed_painter(params)
             replace_image(files[index], paint(base, hole, params.seed + numbers[index]))
     images = [load_image(file) for file in files]
-    seams = inpaint.seam_score(torch.stack([inpaint.to_input(each) for each in images]), torch.from_numpy(hole))
-    name = painters.name_seed_painter(params.inpainter)
-    return Candidates.by_score(images, numbers, params.choose, seams=seams.tolist(), painter=name)
+    pictures = torch.stack([inpaint.to_input(each) for each in images])
+    seams = inpaint.seam_score(pictures, torch.from_numpy(hole)).tolist()
+    facts = {"seams": seams, "painter": painters.name_seed_painter(params.inpainter)}
+    return Candidates.by_score(images, numbers, seams, params.choose, facts)
 
 
 def _paint_once(painter: Painter, base: np.ndarray, masks: MaskSet) -> Candidates:
