@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reffusion.clicks.segmenter import DEVIATION, MEAN, Segmenter
+from reffusion.io.arrays import load_json, save_json
 from reffusion.metrics import leftovers, rows
 from reffusion.metrics.leftovers import FOUND, find_leftovers, measure_share
 
@@ -40,7 +41,7 @@ def draw_views(background, thing, remaining):
 
 @pytest.mark.parametrize("remaining", [0.0, 0.2, 0.5, 1.0])
 @pytest.mark.parametrize("thing", [(200, 40, 40), (30, 30, 30)], ids=["red", "dark"])
-def test_what_remains_is_found_and_nothing_else(thing, remaining):
+def test_what_remains_is_found_and_nothing_else(tmp_path, thing, remaining):
     before, after, mask = draw_views((120, 140, 110), thing, remaining)
     true = mask & (before == after).all(-1)
     found = find_leftovers(NETWORK, before, after, mask)
@@ -48,7 +49,11 @@ def test_what_remains_is_found_and_nothing_else(thing, remaining):
         assert not found.any()
     else:
         assert (found & true).sum() > 0.9 * true.sum() and (found & ~true).sum() < 0.02 * mask.sum()
-        assert measure_share(NETWORK, before, after, mask) == pytest.approx(found.sum() / mask.sum())
+        share = measure_share(NETWORK, before, after, mask)
+        assert share == pytest.approx(found.sum() / mask.sum())
+        summary = rows.summarize_leftovers([{leftovers.COLUMN: share}], None)
+        save_json(tmp_path / "summary.json", summary)  # as the stage does
+        assert load_json(tmp_path / "summary.json") == summary
 
 
 def test_a_thing_of_the_backgrounds_color_is_no_leftover():

@@ -63,4 +63,4 @@ def find_leftovers(segmenter: Segmenter, before: np.ndarray, after: np.ndarray, 
 
 def measure_share(segmenter: Segmenter, before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
     """Return the share of the mask's pixels, at least one, that `find_leftovers` finds; the arguments are the same."""
-    return np.count_nonzero(find_leftovers(segmenter, before, after, mask)) / np.count_nonzero(mask)
+    return float(find_leftovers(segmenter, before, after, mask)[mask].mean())
