@@ -130,10 +130,10 @@ made := $(if $(call rest,$(plain),$(scene)),,$(filter demo demo-%,$(scene)))
 
 demo: setup
 	@out="data/$${name:-demo$${seed:+-$$seed}}" && \
-		$(PY) data/generate.py --out="$$out" --seed="$${seed:-0}" && touch "$$out/.generated"
+		$(PY) -m lab.scenes.generate --out="$$out" --seed="$${seed:-0}" && touch "$$out/.generated"
 
 data/%/.generated: | $(VENV)/.ready
-	$(strip $(PY) data/generate.py --out data/$* $(patsubst %,--kind %,$(filter $(kinds),$(subst -, ,$*))) \
+	$(strip $(PY) -m lab.scenes.generate --out data/$* $(patsubst %,--kind %,$(filter $(kinds),$(subst -, ,$*))) \
 		$(patsubst %,--seed %,$(filter-out demo $(kinds),$(subst -, ,$*))))
 	@touch $@
 
@@ -199,7 +199,7 @@ gc: setup
 	@$(RUN) gc $(call flags,$(options) yes)
 
 spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
-	$(if $(filter spinnerf,$@),@$(PY) data/spinnerf.py --data="$$data")
+	$(if $(filter spinnerf,$@),@$(PY) -m lab.studies.spinnerf --data="$$data")
 	@$(RUN) batch --data="$$data" $(call flags,$(filter-out scene,$(options)) $(cluster))
 
 doctor: setup
@@ -210,33 +210,33 @@ weights: setup
 		--set="$$set$(if $(painter), reference.inpainter=$$painter)"
 
 prior: runs/prior/photographs runs/prior/rooms
-	$(PY) -m priors.tiny.train --start priors/tiny --photographs runs/prior/photographs --rooms runs/prior/rooms $(call flags,steps)
+	$(PY) -m lab.prior.train --start priors/tiny --photographs runs/prior/photographs --rooms runs/prior/rooms $(call flags,steps)
 
 runs/prior/rooms: | setup
-	$(PY) -m priors.tiny.rooms $@
+	$(PY) -m lab.prior.rooms $@
 
 runs/prior/photographs: | setup
-	$(PY) -m priors.tiny.photographs $@
+	$(PY) -m lab.prior.photographs $@
 
 # Personalizes on the reference of the demo scene, which is made first where it is missing.
 prior-report: data/demo/.generated setup
 	@$(RUN) run reference --scene demo --profile laptop
-	$(PY) -m benchmarks.studies.prior --start 0.35 --steps 1 4 12 --run runs/demo --out runs/prior-report
+	$(PY) -m lab.studies.prior --start 0.35 --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
 # Runs personalization and initialization first, where they are missing.
 sds-variance: ready
 	@$(RUN) run personalize $(call flags,$(options)) --set="distill.sds.run=always $$set"
 	@$(RUN) run initialize $(call flags,$(options))
-	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype)
+	$(PY) -m lab.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype)
 
 adapted: ready
 	@$(RUN) run personalize $(call flags,$(options)) --set="distill.sds.run=always $$set"
-	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype steps)
+	$(PY) -m lab.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype steps)
 
 # On the generated scene demo-sparse, with seeds=3 on two others, too (hours).
 sparse: ready $(others)
-	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) \
+	$(PY) -m lab.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) \
 		--out="$${runs:-runs}/sparse"
 
 # Three processes with one thread each, since many tests wait for others that they start. Each gets whole files, so that
@@ -257,20 +257,20 @@ lint: $(VENV)/.ready-dev
 
 # slow=1 adds the rendering of 100,000 Gaussians and more.
 bench: $(VENV)/.ready
-	$(PY) -m benchmarks.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
-	$(if $(slow),$(PY) -m benchmarks.bench.large)
+	$(PY) -m lab.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
+	$(if $(slow),$(PY) -m lab.bench.large)
 
 stability: $(VENV)/.ready-dev
-	$(PY) -m benchmarks.stability --out="$${runs:-runs}/stability.json"
+	$(PY) -m lab.stability --out="$${runs:-runs}/stability.json"
 
 # Checks first what an installation cannot fix. MAX_JOBS limits the number of compilers, which take up to 1 GB each.
 gpu: $(VENV)/.ready
-	@$(PY) -m benchmarks.gpu.ready --before
+	@$(PY) -m lab.gpu.ready --before
 	$(PY) -m pip install --quiet $(bytecode) --constraint $(pins) --editable '.[gpu]'
-	@$(PY) -m benchmarks.gpu.ready
+	@$(PY) -m lab.gpu.ready
 
 gpu-check: $(VENV)/.ready
-	$(PY) -m benchmarks.gpu.check --out="$${runs:-runs}/gpu-check"
+	$(PY) -m lab.gpu.check --out="$${runs:-runs}/gpu-check"
 
 # The documents as a site in build/site. They are copied with their paths, so that links between them hold.
 documents := $(wildcard *.md docs/*.md docs/images/* data/*.md priors/tiny/*.md plugins/nerfbaselines/*.md)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 # name -> (the module that it runs, help)
 COMMANDS = {
-    "demo": ("generate", "make the demo scene, data/demo (demo --help: others)"),
+    "demo": ("lab.scenes.generate", "make the demo scene, data/demo (demo --help: others)"),
     "plan": ("runner", "what would run, and why"),
     "run": ("runner", "run the whole job (run all), or one stage and what it needs"),
     "app": ("report.app", "one page from photographs to the finished scene, in a browser"),
@@ -124,7 +124,7 @@ def main() -> None:
     if module != "runner":
         del sys.argv[1]
     # not the folder of this file: its `io` and `types` would hide Python's modules
-    sys.path.insert(0, str(root() / "data" if name == "demo" else root()))
+    sys.path.insert(0, str(root()))
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     except SystemExit as end:  # print the message of an exit as one line, without a traceback

@@ -1,4 +1,4 @@
-"""Page of the measurements of `benchmarks/studies/prior.py`: tables, charts and sheets of pictures.
+"""Page of the measurements of `lab/studies/prior.py`: tables, charts and sheets of pictures.
 
 The benchmark measures the diffusion prior on holes at three *scales*: the reference's own hole (`reference`), whole
 unseen views (`whole`), and windows around the hole in unseen views (`window`). It does so before and after the prior is
@@ -38,7 +38,7 @@ def make(folder: Path) -> Path:
         ValueError: the folder has no measurements (prior.json).
     """
     if not (folder / "prior.json").exists():
-        raise ValueError(f"{folder / 'prior.json'}: missing; first `python -m benchmarks.studies.prior --out {folder}`")
+        raise ValueError(f"{folder / 'prior.json'}: missing; first `python -m lab.studies.prior --out {folder}`")
     measured = load_json(folder / "prior.json")
     lines = [f"# {measured['prior']}, measured", ""]
     for name in ("inpainting", "photographs"):
@@ -199,7 +199,7 @@ def save_charts(personal: dict[str, Any], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="report.prior", description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path, help="what benchmarks/studies/prior.py wrote to")
+    parser.add_argument("folder", type=Path, help="what lab/studies/prior.py wrote to")
     try:
         print(make(parser.parse_args().folder))
     except ValueError as error:

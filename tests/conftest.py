@@ -1,7 +1,6 @@
 """Fixtures that several test files use."""
 
 import os
-import sys
 import tempfile
 from pathlib import Path
 
@@ -10,19 +9,13 @@ import pytest
 # Use an empty cache: no test result may depend on the weights in the cache of the user who runs the tests.
 os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
-DATA = Path(__file__).parents[1] / "data"
-
 
 @pytest.fixture(scope="module")
 def generate():
-    """The module data/generate.py. While the fixture is active, the other modules in data/ can be imported too."""
-    sys.path.insert(0, str(DATA))
-    try:
-        import generate
+    """The generator of made scenes."""
+    from lab.scenes import generate
 
-        yield generate
-    finally:
-        sys.path.remove(str(DATA))
+    return generate
 
 
 @pytest.fixture(scope="module")

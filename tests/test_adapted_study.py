@@ -7,7 +7,7 @@ import pytest
 from scenes.distill_scene import write_initialized_run
 from scenes.networks import small_prior
 
-from benchmarks.studies import adapted, scene_priors
+from lab.studies import adapted, scene_priors
 from reffusion.io.arrays import save_labels
 from reffusion.io.images import load_image, save_image
 from reffusion.io.ply import load_ply, save_ply

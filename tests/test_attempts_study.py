@@ -9,7 +9,7 @@ import torch
 from scenes import wall_scene
 from scenes.stage_runs import run_through_initialize
 
-from benchmarks.studies import attempts as benchmark
+from lab.studies import attempts as benchmark
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.metrics import image_metrics

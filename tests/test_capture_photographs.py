@@ -10,7 +10,7 @@ from PIL import Image
 from scenes.capture_checks import run_with_messages
 from scenes.room import render_room_corner, room_textures, room_walk
 
-from benchmarks.studies.bare_photographs import pose_errors
+from lab.studies.bare_photographs import pose_errors
 
 pytestmark = pytest.mark.integration
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from scenes.cameras import rotation_along
 
-from benchmarks.studies import composites, compositing, drawn_places, holes, placement, scoring
+from lab.studies import composites, compositing, drawn_places, holes, placement, scoring
 from reffusion.capture import lens
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import save_points

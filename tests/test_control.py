@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.studies import exact_prior
+from lab.studies import exact_prior
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import load_prior
 from reffusion.seeding import generator

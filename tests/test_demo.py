@@ -146,7 +146,7 @@ def test_only_masked_pixels_change_when_the_object_goes(generate, mini_scene):
 
 def test_test_views_are_without_the_object(generate, mini_scene):
     """A test view rendered again with the object differs inside its mask, and only inside its mask."""
-    import photographs
+    from lab.scenes import photographs
 
     kind = generate.KINDS["mini"]
     furniture, target = generate.furnish(0, kind)
@@ -169,8 +169,7 @@ def test_never_seen_pixels_are_never_seen(generate, mini_scene):
 
     The test projects the background points by truth/cameras.json and not by the generator's own code.
     """
-    import photographs
-    import raycast
+    from lab.scenes import photographs, raycast
 
     kind = generate.KINDS["mini"]
     truth = json.loads((mini_scene / "truth/cameras.json").read_text())

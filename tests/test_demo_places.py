@@ -31,7 +31,7 @@ def shrink_kind(kind):
 
 def photograph_scene(generate, kind, seed: int):
     """Return the solids, the cameras of the training views, and the photographs of a generated scene."""
-    import photographs
+    from lab.scenes import photographs
 
     furniture, target = generate.furnish(seed, kind)
     world = generate.bake(furniture, seed, kind)
@@ -40,8 +40,7 @@ def photograph_scene(generate, kind, seed: int):
 
 
 def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
-    import photographs
-    import raycast
+    from lab.scenes import photographs, raycast
 
     kind = shrink_kind(generate.KINDS["behind"])
     for seed in (0, 1, 2):
@@ -61,9 +60,8 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
 
 def test_the_object_hides_a_part_of_a_thing_close_to_it_in_the_reference_view(generate):
     """Four things that stay stand within half the object's radius. Other views show the hidden part."""
-    import photographs
-    import raycast
-    from solids import ROOM
+    from lab.scenes import photographs, raycast
+    from lab.scenes.solids import ROOM
 
     kind = shrink_kind(generate.KINDS["beside"])
     for seed in (0, 1):
@@ -102,8 +100,7 @@ def test_the_table_stands_in_free_space(generate):
 
 def test_behind_the_object_a_corner_makes_a_step(generate):
     """Without the object, the hole of the middle view shows a wall that juts out and a surface far behind it."""
-    import photographs
-    import raycast
+    from lab.scenes import photographs, raycast
 
     kind = shrink_kind(generate.KINDS["corner"])
     solids, cameras, session = photograph_scene(generate, kind, 0)
@@ -139,9 +136,9 @@ def test_leaves_are_where_the_rays_meet_them(generate):
     A second ray, started just before the hit, meets a leaf at the hit or nearer. No camera sees a point just behind
     the leaf.
     """
-    import raycast
-    import solids as solid
-    from furniture import Furniture, Material
+    from lab.scenes import raycast
+    from lab.scenes import solids as solid
+    from lab.scenes.furniture import Furniture, Material
 
     f = Furniture()
     f.room((0, 2, 0), (4, 2, 4), *[Material("white")] * 6)

@@ -31,11 +31,8 @@ def wheel_folder(tmp_path_factory) -> Path:
         tmp_path_factory.mktemp("copy"),
         tmp_path_factory.mktemp("out"),
     )  # a build leaves folders in its source folder
-    for name in (*FOLDERS, "priors"):
+    for name in (*FOLDERS, "priors", "lab"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "data").mkdir()
-    for path in (ROOT / "data").glob("*.py"):
-        shutil.copy(path, copy / "data")
     for name in ("pyproject.toml", "pipeline.yaml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
     for name in (
@@ -62,8 +59,8 @@ def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess
 def test_all_is_in_one_package(wheel_folder):
     assert sorted(path.suffix or path.name for path in wheel_folder.iterdir()) == [".dist-info", "reffusion"]
     app = wheel_folder / "reffusion" / "app"
-    assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", "data", *FOLDERS[1:]}
-    assert {path.name for path in (app / "data").iterdir()} == {path.name for path in (ROOT / "data").glob("*.py")}
+    assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", "lab", *FOLDERS[1:]}
+    assert {path.name for path in (app / "lab").iterdir()} == {"__init__.py", "scenes"}
     ours = [path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".yaml")]
     ours += [path for path in (ROOT / "priors" / "tiny").rglob("*") if path.suffix in (".json", ".safetensors")]
     for path in ours:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from scenes.processes import fake_nvidia_smi
 
-from benchmarks.gpu import ready
+from lab.gpu import ready
 from reffusion.io import machine
 from reffusion.io.machine import Machine, find_missing
 from runner import worker

@@ -237,7 +237,7 @@ def test_constants_of_the_library():
 
     import torch
 
-    from benchmarks.gpu import full_size
+    from lab.gpu import full_size
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.metrics import image_metrics
     from reffusion.params.base import Prompts

@@ -20,7 +20,7 @@ from scenes.networks import small_depth_model
 from scenes.simulated_gpu import has_gpu
 from test_paper import DOC, parse_rows
 
-from benchmarks.gpu import full_size
+from lab.gpu import full_size
 from reffusion.depth import monocular
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image

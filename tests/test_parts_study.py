@@ -8,7 +8,7 @@ import pytest
 from scenes.capture import make_truth, write_capture
 from scenes.stage_runs import run_through_initialize
 
-from benchmarks.studies import parts, switches
+from lab.studies import parts, switches
 from reffusion.inpaint import exemplar
 from reffusion.io.arrays import save_json
 from reffusion.params.initialize import Params

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.studies import holes
-from benchmarks.studies import prior as benchmark
-from priors.tiny import images
+from lab.prior import images
+from lab.studies import holes
+from lab.studies import prior as benchmark
 from reffusion.io.images import load_image, save_image
 from reffusion.metrics import image_metrics
 from report import prior as page
@@ -136,5 +136,5 @@ def test_the_page_holds_every_table_and_picture(tmp_path):
 
 
 def test_without_a_measurement_the_page_says_what_to_run(tmp_path):
-    with pytest.raises(ValueError, match=r"python -m benchmarks\.studies\.prior"):
+    with pytest.raises(ValueError, match=r"python -m lab\.studies\.prior"):
         page.make(tmp_path)

@@ -11,9 +11,9 @@ import safetensors.torch
 import torch
 from scenes.networks import save_small_prior
 
-from priors.tiny import build, images, train
-from priors.tiny.photographs import PHOTOGRAPHS, load_photographs, short_name
-from priors.tiny.rooms import load_rooms
+from lab.prior import build, images, train
+from lab.prior.photographs import PHOTOGRAPHS, load_photographs, short_name
+from lab.prior.rooms import load_rooms
 
 pytestmark = pytest.mark.integration
 
@@ -45,7 +45,7 @@ def test_held_out_photographs_never_train(photographs):
 def test_a_missing_photograph_is_named(photographs, tmp_path):
     shutil.copytree(photographs, tmp_path / "some")
     (tmp_path / "some" / "Wood.jpg").unlink()
-    with pytest.raises(ValueError, match=r"Wood missing; run python -m priors\.tiny\.photographs"):
+    with pytest.raises(ValueError, match=r"Wood missing; run python -m lab\.prior\.photographs"):
         load_photographs(tmp_path / "some", held_out=False)
 
 
@@ -98,7 +98,7 @@ def test_rooms_that_are_held_out_never_train(rooms):
 
 
 def test_a_folder_without_rooms_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"no picture of a room; run python -m priors\.tiny\.rooms"):
+    with pytest.raises(ValueError, match=r"no picture of a room; run python -m lab\.prior\.rooms"):
         load_rooms(tmp_path, held_out=False)
 
 

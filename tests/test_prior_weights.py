@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from priors.tiny import build, images, train
+from lab.prior import build, images, train
 from reffusion.params.base import Prompts
 from reffusion.prior import diffusion
 from reffusion.prior.model import load_prior

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.gpu import check as gpu_check
-from benchmarks.gpu import exact as gpu_exact
-from benchmarks.gpu import full_size as F
-from benchmarks.gpu import steps as gpu_steps
+from lab.gpu import check as gpu_check
+from lab.gpu import exact as gpu_exact
+from lab.gpu import full_size as F
+from lab.gpu import steps as gpu_steps
 from reffusion.params.base import Prompts
 from reffusion.prior import denoising, diffusion, inpaint, lora, memory
 from reffusion.prior.model import drop_text_encoders, enable_checkpointing, load_prior, pipeline

@@ -13,7 +13,7 @@ from scenes.capture import real_capture
 from scenes.images import natural_noise, paint_red, psnr, rectangle_mask
 from scenes.references import reference_entry, run_reference_stage
 
-from benchmarks.studies import redrawn
+from lab.studies import redrawn
 from reffusion.capture.views import load_placed_views
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput

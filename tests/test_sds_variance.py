@@ -9,7 +9,7 @@ import torch
 from scenes.distill_scene import write_initialized_run
 from scenes.networks import small_prior
 
-from benchmarks.studies import sds_variance as benchmark
+from lab.studies import sds_variance as benchmark
 from reffusion import seeding
 
 pytestmark = pytest.mark.integration

@@ -19,7 +19,7 @@ from scenes.capture import real_capture
 from scenes.room import render_room_corner, room_textures, room_walk, speckle_texture
 from scipy.spatial.transform import Rotation
 
-from benchmarks.studies.bare_photographs import pose_errors
+from lab.studies.bare_photographs import pose_errors
 from reffusion.capture import sfm
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.load import load_capture
@@ -196,8 +196,8 @@ def test_focal_length_from_exif(tmp_path, ending):
 @slow
 def test_demo_photos(tmp_path):
     """All photographs of the generated demo scene are placed at their true poses."""
-    made = [sys.executable, str(ROOT / "data" / "generate.py"), "--out", str(tmp_path / "s"), "--kind", "photos"]
-    subprocess.run(made, check=True)
+    made = [sys.executable, "-m", "lab.scenes.generate", "--out", str(tmp_path / "s"), "--kind", "photos"]
+    subprocess.run(made, check=True, cwd=ROOT)
     record = json.loads((tmp_path / "s" / "truth" / "cameras.json").read_text())
     truth = {name: np.array(pose) for name, pose in record["world_to_camera"].items()}
     scene = run_poses(tmp_path / "s", tmp_path / "out")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.stability import __main__ as command
-from benchmarks.stability import all_cases, random_scenes, run
-from benchmarks.stability.cases import Case
-from benchmarks.stability.faults import FAULTS, is_caught
+from lab.stability import __main__ as command
+from lab.stability import all_cases, random_scenes, run
+from lab.stability.cases import Case
+from lab.stability.faults import FAULTS, is_caught
 
 CASES = {case.name: case for case in all_cases()}
 LONG = [case.name for case in random_scenes.CASES]  # a tenth of their scenes runs here, all run in `make stability`

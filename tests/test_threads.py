@@ -71,7 +71,7 @@ class Watch:
         if name in ("numpy", "torch"):
             print(name, os.environ.get("OMP_NUM_THREADS"), os.environ.get("OPENBLAS_NUM_THREADS"))
 sys.meta_path.insert(0, Watch())
-import benchmarks.bench.__main__
+import lab.bench.__main__
 """
     others = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     root = Path(__file__).resolve().parent.parent

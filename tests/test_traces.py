@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 from scenes.networks import save_small_prior
 from scenes.stage_runs import run_through_initialize, trace_lines
 
-from benchmarks.bench import gate
-from benchmarks.bench.points import Diagram, Point, recommendation
+from lab.bench import gate
+from lab.bench.points import Diagram, Point, recommendation
 from reffusion import trace
 from reffusion.depth.background_depth import CompletionSettings
 from reffusion.distill import loop as distilling
@@ -330,7 +330,7 @@ def points_of_baselines(baselines: dict) -> list[Diagram]:
 
 
 def test_the_gate_sees_a_planted_regression():
-    baselines = gate.load(ROOT / "benchmarks" / "bench" / "baselines.json")
+    baselines = gate.load(ROOT / "lab" / "bench" / "baselines.json")
     diagrams, unit = points_of_baselines(baselines), baselines["machine_unit"]
     assert gate.regressions(diagrams, unit, baselines) == []
     assert gate.regressions(diagrams, 2 * unit, baselines) == [], "a machine half as fast may take twice as long"
@@ -349,7 +349,7 @@ def test_the_gate_sees_a_planted_regression():
     more["diagrams"][name]["8 px, step 0"] = [1.0, 1.0]
     assert "was not measured" in gate.regressions(diagrams, unit, more)[0]
     with pytest.raises(ValueError, match="--write-baselines"):
-        gate.load(ROOT / "benchmarks" / "none.json")
+        gate.load(ROOT / "lab" / "none.json")
 
 
 def test_the_recommended_setting_is_the_cheapest_that_is_as_good_as_the_best():

@@ -9,7 +9,7 @@ import pytest
 from scenes.distill_scene import write_initialized_run
 from scenes.networks import small_prior
 
-from benchmarks.studies import unseen
+from lab.studies import unseen
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 from reffusion.io.scene import load_scene, save_references, save_scene

@@ -16,7 +16,7 @@ class Published:
     """A model of the hub.
 
     Attributes:
-        parameters: total number of parameters, counted from the configuration (benchmarks/gpu/full_size.py).
+        parameters: total number of parameters, counted from the configuration (lab/gpu/full_size.py).
         instead: alternative models, for messages.
     """
 

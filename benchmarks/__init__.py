@@ -1,1 +1,0 @@
-"""Measurements: suites `bench`, `stability` and `gpu` (`python -m benchmarks.SUITE`); `studies`: one question each."""

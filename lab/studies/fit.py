@@ -1,0 +1,157 @@
+"""LPIPS and PSNR of held-out views against seconds of fitting: `python -m lab.studies.fit --run runs/demo`.
+
+The study fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every
+8th training view is held out and only measured. The seconds do not include the measurements, but include making the
+initial points. The study writes fit.png (curves), fit.csv (all measurements) and fit.md (final values) to --out.
+Variants whose results are already in --out are not run again; an interrupted fit continues.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from reffusion import trace
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene, load_views
+from reffusion.metrics import image_metrics, lpips
+from reffusion.splat.rasterizer import render
+from stages import fit
+
+ROOT = Path(__file__).parents[2]
+VARIANTS = {  # name -> differences from the profile's parameters of `fit`
+    "laptop": {},
+    "laptop, half the steps": {"iterations": 800},
+    "laptop, twice the steps": {"iterations": 3200},
+    "laptop, .4 Gaussians a pixel": {"densify.per_pixel": 0.4},
+    "laptop, twice the steps and Gaussians": {"iterations": 3200, "densify.per_pixel": 2},
+    "sparse points only": {"init.flow_cell": 0},
+    "antialiased": {"antialiased": True},
+    "exposure": {"exposure": "always"},
+    "3DGS's rates": {
+        "lr.means": 1.6e-4,
+        "lr.scales": 5e-3,
+        "lr.quats": 1e-3,
+        "lr.sh0": 2.5e-3,
+        "lr.shN": 1.25e-4,
+    },
+}
+
+
+def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
+    """Return a profile's parameters of `fit` with overrides.
+
+    Args:
+        profile: name of the profile.
+        overrides: dotted name of a parameter -> value.
+        every: every n-th training view is held out.
+
+    Raises:
+        ValueError: a parameter is unknown; the message names it.
+    """
+    params = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
+    return fit.Params(**params).changed({**overrides, "holdout": every})
+
+
+def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
+    """Run a fit in the folder `out`, unless it is finished there, and return its trace.
+
+    Args:
+        poses: folder of the stage `poses`.
+        out: folder of the fit.
+        params: parameters of the stage `fit`.
+
+    Raises:
+        ValueError: `out` has a fit with other parameters.
+    """
+    saved = out / "params.json"
+    if saved.exists() and json.loads(saved.read_text()) != params.model_dump():
+        raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    saved.write_text(json.dumps(params.model_dump()))
+    if not (out / "gaussians.ply").exists():
+        fit.run(params, out, poses=poses)
+    return trace.read_trace(out / "trace.jsonl")
+
+
+def measure_lpips(poses: Path, folder: Path, every: int) -> float:
+    """Return the mean LPIPS (vgg) of the held-out views, rendered from the fit in `folder`, over whole views.
+
+    Raises:
+        ValueError: the weights of LPIPS are not on this machine.
+    """
+    scene, gaussians = load_scene(poses), load_ply(folder / "gaussians.ply")
+    model, reason = lpips.load("vgg")
+    if model is None:
+        raise ValueError(reason)
+    values = []
+    for name, photo in load_views(poses, scene.train[every // 2 :: every]).items():
+        target = image_metrics.lpips_targets(photo / np.float32(255), {"vgg": model})["vgg"]
+        assert target is not None
+        values.append(target.distance(render(gaussians, scene.cameras[name]).color.clamp(0, 1).numpy()))
+    return float(np.mean(values))
+
+
+def draw(curves: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
+    """Draw the PSNR of held-out views against seconds from the first second on, one curve per variant.
+
+    Args:
+        curves: variant -> lines of its trace.
+        title: title of the chart.
+        path: PNG to write.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for name, lines in curves.items():
+        late = [line for line in lines if line["seconds"] >= 1]
+        axes.plot([p["seconds"] for p in late], [p["psnr_held_out"] for p in late], marker=".", label=name)
+    axes.set(xscale="log", xlabel="seconds of fitting", ylabel="PSNR of held-out views (dB)", title=title)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, its stage `poses` finished")
+    parser.add_argument("--out", type=Path, help="default: runs/fit/<scene>")
+    parser.add_argument("--profile", default="laptop")
+    parser.add_argument("--every", type=int, default=8, help="hold out every n-th training view")
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants")
+    arguments = parser.parse_args()
+    poses, out = arguments.run / "poses", arguments.out or Path("runs/fit") / arguments.run.name
+    if not (poses / "receipt.json").exists():
+        raise ValueError(f"{poses} is missing: run `make scene={arguments.run.name} poses` first")
+    chosen = {
+        name: fit_params(arguments.profile, VARIANTS[name], arguments.every) for name in arguments.only or VARIANTS
+    }
+    curves, perceptual = {}, {}
+    for name, params in chosen.items():
+        folder = out / name.replace(" ", "_").replace(",", "")
+        curves[name] = run_fit(poses, folder, params)
+        perceptual[name], last = measure_lpips(poses, folder, arguments.every), curves[name][-1]
+        print(
+            f"{name}: LPIPS {perceptual[name]:.4f}, {last['psnr_held_out']:.2f} dB after {last['seconds']:.0f} s, "
+            f"{last['gaussians']} Gaussians"
+        )
+    columns = ("seconds", "iteration", "gaussians", "psnr", "psnr_held_out")
+    rows = [",".join([name.replace(",", ";"), *(str(p[c]) for c in columns)]) for name in curves for p in curves[name]]
+    (out / "fit.csv").write_text("\n".join([",".join(["variant", *columns]), *rows]) + "\n")
+    ends = [(name, lines[-1]) for name, lines in curves.items()]
+    cells = [
+        f"| {n} | {p['seconds']:.0f} | {p['gaussians']} | {perceptual[n]:.4f} | {p['psnr_held_out']:.2f} |"
+        for n, p in ends
+    ]
+    head = "| variant | seconds | Gaussians | held-out LPIPS (vgg) | held-out PSNR (dB) |\n|---|---|---|---|---|\n"
+    (out / "fit.md").write_text(head + "\n".join(cells) + "\n")
+    draw(curves, f"{arguments.run.name}, every {arguments.every}th view held out", out / "fit.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""Print a line for each of SPIn-NeRF's scenes in a folder: `python -m lab.studies.spinnerf --data FOLDER`.
+
+A line has the numbers of views and the parts that the scene lacks, or says that a published scene is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from reffusion.capture import spinnerf_scenes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
+    try:
+        print("\n".join(spinnerf_scenes.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
