@@ -6,14 +6,11 @@ Renders of the initialization and of the result are compared with ground truth i
 from __future__ import annotations
 
 import shutil
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reffusion import trace
-from reffusion.background import training_coverage
 from reffusion.fit import exposure
 from reffusion.inpaint import feedforward
 from reffusion.io.arrays import load_json, save_json
@@ -21,14 +18,12 @@ from reffusion.io.ground_truth import load_ground_truth, load_object_mask, load_
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_object_mask, load_scene
-from reffusion.kernels.compiled import side_by_side, views_at_once
-from reffusion.metrics import image_metrics, leftovers, lpips, rows
+from reffusion.metrics import evaluation, image_metrics, leftovers, lpips, rows
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.view_renders import ViewRenderer, ViewRenders
 from reffusion.params.evaluate import Params
-from reffusion.types import Gaussians, Scene
+from reffusion.types import Gaussians
 
-MAX_UNSCORED = 64  # most training views that are rendered where there are no test views
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}  # stage -> its renders
 
 
@@ -59,47 +54,33 @@ def run(
             are None if the stage was skipped.
     """
     scene, facts = load_scene(poses), load_json(finish / "facts.json")
-    names, kind = views_to_render(scene)
-    gaussians = load_stages(finish, {"fit": fit, "initialize": initialize, "distill": distill}, params.device)
+    names, kind = evaluation.views_to_render(scene)
     painter = feedforward.load_inpainter(params.inpainter, params.device) if params.inpaint else None
     exposures = exposure.view_exposures(fit, list(scene.cameras.values()))
+    gaussians = load_stages(finish, {"fit": fit, "initialize": initialize, "distill": distill}, params.device)
     renderer = ViewRenderer(gaussians, facts["result"], painter, exposures)
-    loaded = {net: lpips.load(net) for net in ("vgg", "alex")}
-    models = {net: model for net, (model, _) in loaded.items() if model}
-    longest = reduced_side(params, raw_masks)
-    unseen = unseen_by_training(scene, fit, raw_masks, masks, params.device)
-    segmenter, no_segmenter = leftovers.load_segmenter()
-    examined = names[:: -(-len(names) // leftovers.MOST_VIEWS)] if segmenter and facts["result"] != "fit" else ()
+    object_masks = load_training_object_masks(scene, raw_masks, masks) if scene.test else {}
+    unseen = evaluation.unseen_by_training(scene, load_ply(fit / "gaussians.ply", device=params.device), object_masks)
     has_truth = kind == "test" and not (masks and load_json(masks / "facts.json").get("kept"))
+    networks = {net: lpips.load(net) for net in ("vgg", "alex")}
+    segmenter, no_segmenter = leftovers.load_segmenter()
+    examined = names[:: -(-len(names) // leftovers.MOST_VIEWS)] if facts["result"] != "fit" else ()
+    models = {net: model for net, (model, _) in networks.items() if model}
+    scorer = evaluation.ViewScorer(models, reduced_side(params, raw_masks), segmenter, examined)
 
     def evaluate_view(name: str) -> tuple[RenderedView, dict[str, Any]]:
-        camera = scene.cameras[name]
-        picture = load_ground_truth(camera, poses) if has_truth else None
-        renders = renderer.render(camera, load_object_mask(camera, raw_masks, masks), picture)
+        picture = load_ground_truth(scene.cameras[name], poses) if has_truth else None
+        renders = renderer.render(scene.cameras[name], load_object_mask(scene.cameras[name], raw_masks, masks), picture)
         save_renders(out, renders, picture)
         truth = rows.GroundTruth(picture, has_object_mask(raw_masks, masks, name), unseen.get(name))
-        row = rows.score_row(renders.result, renders.by_stage.get("initialize"), truth, models, longest)
-        if segmenter and name in examined and renders.result.mask.any():
-            result = renders.result
-            share = leftovers.measure_share(segmenter, renders.by_stage["fit"], result.picture, result.mask)
-            row[leftovers.COLUMN] = share
-        return renders.result, row
+        return renders.result, scorer.score(renders, truth)
 
-    scored: list[dict[str, Any]] = []
-    previous = None
-    with closing(side_by_side(evaluate_view, names, views_at_once(params.device))) as views:
-        for _ in trace.progress(len(names), "evaluate"):
-            view, row = next(views)
-            if previous:
-                rows.add_consistency(scored[-1], previous, view)
-            previous = view
-            scored.append(row)
-
+    scored = evaluation.score_in_order(evaluate_view, names, params.device)
     (out / "per_view.csv").write_text(rows.to_csv(scored))
     shutil.copyfile(finish / "scene.ply", out / "scene.ply")
     summary = {
         **rows.summarize(scored),
-        "reduced": rows.summarize_reduced(scored, longest),
+        "reduced": rows.summarize_reduced(scored, scorer.longest),
         "imfine_bbox_v1": rows.summarize_imfine(scored),
         "leftovers": rows.summarize_leftovers(scored, no_segmenter),
         "rendered": f"{len(names)} {kind} views",
@@ -110,23 +91,11 @@ def run(
         "consistency": rows.summarize_consistency(scored),
         **networks_used(painter.name if painter else None, distill),
         "exposure": exposure.PROTOCOL if exposures else None,
-        "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
+        "lpips_unavailable": "; ".join(reason for _, reason in networks.values() if reason) or None,
         "gaussians": facts["gaussians"],
         "protocol": rows.protocol(scored, models),
     }
     save_json(out / "metrics.json", summary)
-
-
-def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
-    """Return the names of the views to render, and their kind, e.g. "test", "training" or "training (one in 2)".
-
-    They are the test views. Without test views they are all training views, or every n-th one if there are more than
-    `MAX_UNSCORED`.
-    """
-    if scene.test:
-        return scene.test, "test"
-    step = -(-len(scene.train) // MAX_UNSCORED)
-    return scene.train[::step], "training" + (f" (one in {step})" if step > 1 else "")
 
 
 def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> dict[str, Gaussians]:
@@ -146,27 +115,6 @@ def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> d
             path = completed if completed.exists() else folder / "gaussians.ply"
             gaussians[stage] = load_ply(path, device=device)
     return gaussians
-
-
-def unseen_by_training(
-    scene: Scene, fit: Path, raw_masks: Path, masks: Path | None, device: str
-) -> dict[str, np.ndarray]:
-    """Find the pixels of the test views that show surfaces which no training view saw.
-
-    Args:
-        fit, raw_masks, masks: folders of the stages of these names; `masks` is None if the stage was skipped.
-
-    Returns:
-        Test view -> bool [H, W], True = unseen; empty without test views.
-    """
-    if not scene.test:
-        return {}
-    gaussians = load_ply(fit / "gaussians.ply", device=device)
-    cameras = [scene.cameras[name] for name in scene.train]
-    views = training_coverage.render_coverage_views(
-        gaussians, cameras, load_training_object_masks(scene, raw_masks, masks)
-    )
-    return {name: training_coverage.unseen_pixels(gaussians, scene.cameras[name], views) for name in scene.test}
 
 
 def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> None:

@@ -11,23 +11,25 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from reffusion import seeding, trace
-from reffusion.capture import cameras_around_hole, normalized_frame, sfm
-from reffusion.capture.checks import sanity
-from reffusion.capture.checks.agreement import judge_poses
-from reffusion.capture.layouts import cameras
+from reffusion import trace
+from reffusion.capture import normalized_frame, sfm
+from reffusion.capture.checks.sanity import find_odd_exposures
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.lens import undistortion_map
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.own_splats import OwnSplats, load_own_splats
-from reffusion.capture.preparation import LEAST_POINTS, MORE_POINTS, SEED, adjust_views, choose_size
+from reffusion.capture.preparation import (
+    SEED,
+    adjust_views,
+    choose_size,
+    complete_points,
+    place_gaussians_only,
+    read_capture,
+)
 from reffusion.capture.roles import Roles
-from reffusion.capture.scene_folder import is_gaussians_only, read_scene
+from reffusion.capture.scene_folder import is_gaussians_only
 from reffusion.capture.undistort import (
     describe_transparency,
-    fitting_size,
     resized_lens,
     save_ignored_pixels,
     save_undistorted_view,
@@ -38,7 +40,6 @@ from reffusion.io.ply import save_ply
 from reffusion.io.scene import WARNINGS, load_views, save_scene
 from reffusion.io.splats import Splats
 from reffusion.params.poses import Params
-from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
 SFM_FACTS = "sfm.json"  # file with the `facts` of `sfm.Reconstruction`
@@ -74,15 +75,8 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         assert own_splats is not None  # a scene without photographs has `cleaned`, which requires `gaussians`
         _save_gaussians_only(params, out, scene, own_splats)
         return
-    capture, roles = read_scene(params, scene, params.longest)
-    corrections = []
-    if capture.poses is not None and not params.trust:
-        agreement = judge_poses(capture)
-        print(agreement.summary, flush=True)
-        if agreement.correction is not None:
-            corrections = [agreement.describe(capture.pose_source)]
-            capture, roles = read_scene(params, scene, params.longest, agreement.correction)
-    messages = [*corrections, *capture.warnings, *(own_splats.notes if own_splats else ())]
+    capture, roles, messages = read_capture(params, scene)
+    messages += [*capture.warnings, *(own_splats.notes if own_splats else ())]
     messages += describe_transparency([*roles.train, *roles.test], capture)
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
@@ -106,15 +100,9 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     views = [name for name in views if name in normalized.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
-    _save_warnings(out, [*messages, *contradictions, *_oddities(normalized, out)])
-    if len(normalized.points) < LEAST_POINTS:
-        ranges = normalized_frame.view_depth_ranges(capture.poses, pinholes) * normalized.similarity.scale
-        draws = seeding.generator(SEED, "poses", "random points")
-        shown = replace(normalized, cameras={name: normalized.cameras[name] for name in views})
-        filled = normalized_frame.add_random_points(
-            shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v]
-        )
-        normalized = replace(filled, cameras=normalized.cameras)
+    load_one = lambda name: load_views(out, [name])[name]
+    _save_warnings(out, [*messages, *contradictions, *find_odd_exposures(normalized, load_one)])
+    normalized = complete_points(normalized, capture.poses, pinholes, partial(load_views, out))
     save_scene(out, normalized)
     if own_splats is not None:
         _save_own_splats(out, normalized, own_splats)
@@ -138,35 +126,11 @@ def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
     """Write the stage's files, but no pictures, for a scene of Gaussians with a deleted object and no photographs."""
-    rows, found = own_splats.splats.rows, cameras.read(scene)
-    assert own_splats.edit is not None
-    hole = own_splats.edit.deleted & ~own_splats.edit.scattered
-    means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    # The cameras are those in the scene's folder; without any, some are placed around the hole.
-    poses, source = found or (cameras_around_hole.place_cameras(means, sizes, opaque, hole, params.longest), None)
-    # The sparse points are a random sample of opaque Gaussians.
-    some = np.flatnonzero(opaque)
-    draws = seeding.generator(SEED, "poses", "points of Gaussians")
-    some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
-    colors = (255 * (0.5 + SH0 * rows.sh[some, 0]).clip(0, 1)).round().astype(np.uint8)
-    poses = replace(poses, points=means[some], colors=colors)
-    at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
-    pinholes = {name: undistortion_map(lens)[0] for name, lens in at.items()}
-    placed = normalized_frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
+    placed, pinholes, messages = place_gaussians_only(params, scene, own_splats)
     save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
-    where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
-    _save_warnings(out, [
-        f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
-        "blurred, stays so: with photographs results are sharper",
-        *own_splats.notes,
-    ])  # fmt: skip
+    _save_warnings(out, messages)
     save_scene(out, placed)
     _save_own_splats(out, placed, own_splats)
-
-
-def _oddities(scene: Scene, out: Path) -> list[str]:
-    """Return sentences about photographs whose exposure is odd."""
-    return sanity.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
 def _save_warnings(out: Path, messages: list[str]) -> None:

@@ -21,7 +21,7 @@ from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
-from reffusion.metrics import image_metrics, imfine, rows
+from reffusion.metrics import evaluation, image_metrics, imfine, rows
 from reffusion.morphology import dilate
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, MaskSet, Scene, Similarity
@@ -281,7 +281,7 @@ def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp
 def test_of_many_training_views_every_second():
     names = tuple(f"v{i:03d}" for i in range(70))
     scene = Scene({}, names, (), frozenset(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), SIMILARITY)
-    assert evaluate.views_to_render(scene) == (names[::2], "training (one in 2)")
+    assert evaluation.views_to_render(scene) == (names[::2], "training (one in 2)")
 
 
 def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused(tmp_path, stage_folders):

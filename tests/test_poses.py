@@ -36,7 +36,7 @@ from scenes.capture import (
     write_spin_nerf,
 )
 
-from reffusion.capture import lens, normalized_frame, spinnerf_scenes
+from reffusion.capture import lens, normalized_frame, preparation, spinnerf_scenes
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
@@ -106,7 +106,7 @@ def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, m
             scene, _ = run_stages(folder)
         assert len(scene.points) == 10_000
     else:
-        monkeypatch.setattr(poses, "LEAST_POINTS", 1)
+        monkeypatch.setattr(preparation, "LEAST_POINTS", 1)
         scene, _ = run_stages(folder)
         np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
@@ -277,7 +277,7 @@ def test_transforms_variants(tmp_path, monkeypatch):
     record["ply_file_path"], record["applied_transform"] = "some.ply", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
     (folder / "transforms.json").write_text(json.dumps(record))
     save_points(folder / "some.ply", truth.points, np.zeros((60, 3), np.uint8))
-    monkeypatch.setattr(poses, "LEAST_POINTS", 1)
+    monkeypatch.setattr(preparation, "LEAST_POINTS", 1)
     scene, _ = run_stages(folder)
     assert reprojection_error(scene, truth) < 1e-3
     np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
@@ -339,7 +339,7 @@ def test_pictures_of_several_sizes_each_with_its_camera(tmp_path, layout):
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])
 def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, brings):
     """A scene 1000 times larger, and millions of extents from the origin, has the same normalised cameras."""
-    monkeypatch.setattr(poses, "LEAST_POINTS", 1)
+    monkeypatch.setattr(preparation, "LEAST_POINTS", 1)
     found = []
     for k, (scale, offset) in enumerate([(1.0, (0.0, 0.0, 0.0)), (1000.0, (4e9, -3e9, 1e9))]):
         truth = make_truth(scale=scale, offset=offset)
@@ -368,7 +368,7 @@ def test_random_points_are_seen_seeded_and_colored(tmp_path, monkeypatch):
     folder = write_capture(tmp_path / "s", "transforms", truth)
     monkeypatch.setattr(poses, "MORE_POINTS", 500)
     (scene, _), (again, _) = run_stages(folder), run_stages(folder)
-    monkeypatch.setattr(poses, "SEED", 1)
+    monkeypatch.setattr(preparation, "SEED", 1)
     other, _ = run_stages(folder)
     assert np.array_equal(scene.points, again.points) and not np.array_equal(scene.points, other.points)
     seen = np.zeros(500, int)

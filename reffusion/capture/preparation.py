@@ -1,26 +1,33 @@
-"""Preparation of the views: the size at which pictures are used, views that are left out, and adjusted cameras.
+"""Preparation of the views: corrected poses, the size of pictures, views that are left out, and adjusted cameras.
 
 Functions read undistorted pictures by `load`: names of views -> view name -> uint8 [H, W, 3].
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from reffusion import seeding
-from reffusion.capture import flow, image_detail
+from reffusion.capture import cameras_around_hole, flow, image_detail, normalized_frame
+from reffusion.capture.checks.agreement import judge_poses
 from reffusion.capture.checks.pose_check import check_poses, judge
-from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts import cameras
+from reffusion.capture.layouts.capture import Capture, Poses
+from reffusion.capture.lens import Lens, undistortion_map
+from reffusion.capture.own_splats import OwnSplats
 from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
-from reffusion.capture.undistort import load_resized
+from reffusion.capture.scene_folder import read_scene
+from reffusion.capture.undistort import fitting_size, load_resized
 from reffusion.capture.views import check_outliers
 from reffusion.params.poses import Params
 from reffusion.params.reference import reference_list
+from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
 LEAST_POINTS = 100  # with fewer sparse points, some from optical flow are added
@@ -28,6 +35,26 @@ MORE_POINTS = 10_000  # largest number of added points
 SEED = 0
 
 Load = Callable[[Iterable[str]], dict[str, np.ndarray]]
+
+
+def read_capture(params: Params, scene: Path) -> tuple[Capture, Roles, list[str]]:
+    """Read a scene folder, and correct poses that the photographs contradict unless `params.trust`.
+
+    Returns:
+        The capture, the roles of its views, and a sentence on the correction if there is one.
+
+    Raises:
+        BadInput: as for `read_scene`, or no correction makes poses and photographs agree.
+    """
+    capture, roles = read_scene(params, scene, params.longest)
+    if capture.poses is None or params.trust:
+        return capture, roles, []
+    agreement = judge_poses(capture)
+    print(agreement.summary, flush=True)
+    if agreement.correction is None:
+        return capture, roles, []
+    sentence = agreement.describe(capture.pose_source)
+    return *read_scene(params, scene, params.longest, agreement.correction), [sentence]
 
 
 def choose_size(params: Params, capture: Capture, roles: Roles) -> int:
@@ -71,6 +98,57 @@ def adjust_views(
     return replace(connected, suspects=verdict.suspects), list(verdict.sentences), residuals
 
 
+def complete_points(scene: Scene, poses: Poses, pinholes: Mapping[str, Lens], load: Load) -> Scene:
+    """Add random points to a scene with fewer than `LEAST_POINTS`, within the depths that its views see.
+
+    Args:
+        scene: the scene in the normalised frame.
+        poses: the poses of the capture.
+        pinholes: view -> its undistorted camera, of all views of the scene.
+        load: reads undistorted pictures.
+    """
+    if len(scene.points) >= LEAST_POINTS:
+        return scene
+    shows = [name not in scene.camera_only for name in pinholes]
+    ranges = normalized_frame.view_depth_ranges(poses, pinholes)[shows] * scene.similarity.scale
+    draws = seeding.generator(SEED, "poses", "random points")
+    shown = replace(scene, cameras={name: scene.cameras[name] for name in pinholes if name not in scene.camera_only})
+    filled = normalized_frame.add_random_points(shown, ranges, MORE_POINTS, draws, lambda v: load([v])[v])
+    return replace(filled, cameras=scene.cameras)
+
+
+def place_gaussians_only(
+    params: Params, folder: Path, own_splats: OwnSplats
+) -> tuple[Scene, dict[str, Lens], list[str]]:
+    """Return the scene of a folder with Gaussians, some of them deleted, and without photographs.
+
+    The cameras are those of the folder. Without any, some are placed around the hole.
+
+    Returns:
+        The scene in the normalised frame, its undistorted cameras in its own frame, and sentences for the user.
+    """
+    rows, found = own_splats.splats.rows, cameras.read(folder)
+    assert own_splats.edit is not None
+    hole = own_splats.edit.deleted & ~own_splats.edit.scattered
+    means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
+    poses, source = found or (cameras_around_hole.place_cameras(means, sizes, opaque, hole, params.longest), None)
+    # The sparse points are a random sample of opaque Gaussians.
+    some = np.flatnonzero(opaque)
+    draws = seeding.generator(SEED, "poses", "points of Gaussians")
+    some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
+    colors = (255 * (0.5 + SH0 * rows.sh[some, 0]).clip(0, 1)).round().astype(np.uint8)
+    poses = replace(poses, points=means[some], colors=colors)
+    at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
+    pinholes = {name: undistortion_map(lens)[0] for name, lens in at.items()}
+    placed = normalized_frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
+    where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
+    sentence = (
+        f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
+        "blurred, stays so: with photographs results are sharper"
+    )
+    return placed, pinholes, [sentence, *own_splats.notes]
+
+
 def _adjust_cameras(params: Params, scene: Scene, load: Load) -> tuple[Scene, dict[str, float | None] | None]:
     """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points."""
     residuals = None
@@ -96,11 +174,11 @@ def _refine_cameras(scene: Scene, load: Load) -> tuple[Scene, dict[str, float | 
 
 def _add_flow_points(scene: Scene, load: Load) -> Scene:
     """Add up to `MORE_POINTS` points, triangulated from optical flow between the training views."""
-    cameras = [scene.cameras[name] for name in scene.train]
-    pixels = sum(camera.width * camera.height for camera in cameras)
+    views = [scene.cameras[name] for name in scene.train]
+    pixels = sum(camera.width * camera.height for camera in views)
     # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.
     cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))
-    points, colors = flow.triangulate_points(cameras, load(scene.train), cell)
+    points, colors = flow.triangulate_points(views, load(scene.train), cell)
     kept = np.arange(len(points))
     if len(points) > MORE_POINTS:
         draws = seeding.generator(SEED, "poses", "flow points")
