@@ -366,7 +366,7 @@ def test_depth_has_a_fallback_without_points():
 def test_random_points_are_seen_seeded_and_colored(tmp_path, monkeypatch):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
-    monkeypatch.setattr(poses, "MORE_POINTS", 500)
+    monkeypatch.setattr(preparation, "MORE_POINTS", 500)
     (scene, _), (again, _) = run_stages(folder), run_stages(folder)
     monkeypatch.setattr(preparation, "SEED", 1)
     other, _ = run_stages(folder)
