@@ -1,5 +1,7 @@
-"""reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME: the commands of the runner.
-Other commands (report, check, view, turntable, sheet, export ...) have a --help of their own."""
+"""The runner's commands: reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME.
+
+Other commands (report, check, view, turntable, sheet, export ...) have a --help of their own.
+"""
 
 import argparse
 import os

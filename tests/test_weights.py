@@ -233,7 +233,7 @@ def test_one_set_of_weights_a_part_is_chosen():
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """A local model hub that answers the requests of downloads; one of its models is gated. The fixture `hub` sets:
+    """A local model hub that answers the requests of downloads; one of its models is gated.
 
     Attributes:
         models: name -> file -> bytes.

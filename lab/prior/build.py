@@ -52,7 +52,7 @@ def latents(pixels: Tensor) -> Tensor:
 
 
 def linear_vae() -> AutoencoderKL:
-    """An AutoencoderKL of factor 1 and four latent channels that is a linear map up to 1e-4 of the picture.
+    """Build an AutoencoderKL of factor 1 and four latent channels that is a linear map up to 1e-4 of the picture.
 
     Group norm and SiLU stand between the first and the last convolution; both are made harmless: every signal x
     travels as the pair (x, -x), since silu(x) - silu(-x) = x exactly, and one pair of large constants (c, -c) fixes
@@ -111,7 +111,7 @@ def _gather(conv: torch.nn.Conv2d, gain: float, kernel: torch.Tensor | None = No
 
 
 def tokenizer() -> CLIPTokenizer:
-    """A CLIP tokenizer for bytes and the words of the prompts."""
+    """Build a CLIP tokenizer for bytes and the words of the prompts."""
     letters = _byte_letters()
     vocabulary, merges = [*letters, *(c + "</w>" for c in letters)], []
     for word in WORDS:
@@ -132,7 +132,7 @@ def tokenizer() -> CLIPTokenizer:
 
 
 def _byte_letters() -> list[str]:
-    """The printable letter that byte-level BPE writes for each byte."""
+    """Return the printable letter that byte-level BPE writes for each byte."""
     printable = [*range(ord("!"), ord("~") + 1), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
     others = [b for b in range(256) if b not in printable]
     letters = {b: chr(b) for b in printable} | {b: chr(256 + i) for i, b in enumerate(others)}
@@ -157,7 +157,7 @@ def text_encoder(tokens: CLIPTokenizer) -> CLIPTextModel:
 
 
 def unet(channels: tuple[int, ...] = (32, 64, 96), layers: int = 1) -> UNet2DConditionModel:
-    """A mostly convolutional UNet; attention (to the text and within the view) only at the coarsest level."""
+    """Build a mostly convolutional UNet; attention (to the text and within the view) only at the coarsest level."""
     levels = len(channels)
     return UNet2DConditionModel(
         sample_size=NATIVE,
@@ -186,7 +186,7 @@ def scheduler() -> DDIMScheduler:
 
 
 def betas() -> list[float]:
-    """The cosine schedule, its log signal-to-noise ratio moved by SHIFT (Hoogeboom et al. 2023) and over LOWEST."""
+    """Build the cosine schedule, log signal-to-noise ratio moved by SHIFT (Hoogeboom et al. 2023) and over LOWEST."""
     t = (torch.arange(TIMESTEPS, dtype=torch.float64) + 1) / (TIMESTEPS + 1)
     ratio = (SHIFT - 2 * torch.log(torch.tan(torch.pi / 2 * t))).clamp_min(LOWEST)
     kept = torch.cat([torch.ones(1, dtype=torch.float64), torch.sigmoid(ratio)])

@@ -171,7 +171,7 @@ def bundled_photographs(held_out: bool = False) -> Photographs:
 
 
 def photo_crop(rng: np.random.Generator, photographs: Photographs) -> tuple[np.ndarray, str]:
-    """A crop of a photograph at a random scale, flipped, with its colors shifted."""
+    """Return a crop of a photograph at a random scale, flipped, with its colors shifted."""
     subject, photo = photographs[rng.integers(len(photographs))]
     side = int(SIZE * np.exp(rng.uniform(0, np.log(max(min(photo.shape[:2]) / SIZE, 1.01)))))
     top, left = rng.integers(photo.shape[0] - side + 1), rng.integers(photo.shape[1] - side + 1)
@@ -182,7 +182,7 @@ def photo_crop(rng: np.random.Generator, photographs: Photographs) -> tuple[np.n
 
 
 def room_view(rng: np.random.Generator, rooms: Photographs) -> tuple[np.ndarray, str]:
-    """A picture of a room, mirrored or not: all of it, squeezed to a square as whole views are, or a square part."""
+    """Return a room, mirrored or not: all of the picture, squeezed to a square as whole views are, or a square part."""
     place, room = rooms[rng.integers(len(rooms))]
     if rng.random() < 0.5:
         side = int(rng.integers(SIZE, min(room.shape[:2]) + 1))
@@ -196,7 +196,7 @@ def room_view(rng: np.random.Generator, rooms: Photographs) -> tuple[np.ndarray,
 
 
 def mask(rng: np.random.Generator, size: int) -> np.ndarray:
-    """bool [size, size]: a mask as in the method (silhouettes, a half plane, rectangles), a large one, or all of it."""
+    """Draw a mask, bool [size, size], as in the method (silhouette, half plane, rectangles), large, or all."""
     coverage = rng.random()
     if coverage < FULL_SHARE:
         return np.ones((size, size), bool)
@@ -221,7 +221,7 @@ def mask(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def large_hole(rng: np.random.Generator, size: int) -> np.ndarray:
-    """bool [size, size]: a hole that covers `LARGE_HOLE` of the picture: around a point or beyond a line, wavy."""
+    """Draw a hole, bool [size, size]; it covers `LARGE_HOLE` of the picture, around a point or beyond a line, wavy."""
     ticks = (np.arange(size) + 0.5) / size
     (x, y), angle = rng.uniform(0.2, 0.8, 2), rng.uniform(0, 2 * np.pi)
     round_field = np.hypot(ticks[None] - x, ticks[:, None] - y)

@@ -16,7 +16,7 @@ Texture = Callable[[Field, Field], np.ndarray]  # surface coordinates in texels 
 
 
 def noise_tile(rng: np.random.Generator, slope: float, stretch: float = 1.0, size: int = 256) -> Field:
-    """A periodic random field with power falling as frequency^-slope, deviation 1, longer along x by `stretch`."""
+    """Draw a periodic random field with power falling as frequency^-slope, deviation 1, longer along x by `stretch`."""
     fy, fx = np.meshgrid(np.fft.fftfreq(size) * size, np.fft.rfftfreq(size) * size, indexing="ij")
     frequency = np.sqrt((fx * stretch) ** 2 + fy**2)
     amplitude = np.where(frequency > 0, np.maximum(frequency, 1) ** (-slope / 2), 0)
@@ -26,7 +26,7 @@ def noise_tile(rng: np.random.Generator, slope: float, stretch: float = 1.0, siz
 
 
 def sample(tile: Field, u: Field, v: Field, scale: float) -> Field:
-    """The periodic `tile` at surface coordinates (u, v), `scale` tile texels per surface texel."""
+    """Return the periodic `tile` at surface coordinates (u, v), `scale` tile texels per surface texel."""
     n = tile.shape[0]
     x, y = np.mod(u * scale, n).astype(np.float32), np.mod(v * scale, n).astype(np.float32)
     return cv2.remap(tile, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
@@ -192,7 +192,7 @@ PATTERNS = {
 
 
 def random_texture(rng: np.random.Generator) -> tuple[Texture, str]:
-    """A pattern at a random turn and size, and its name."""
+    """Return a pattern at a random turn and size, and its name."""
     name = str(rng.choice(list(PATTERNS), p=[0.16, 0.2, 0.14, 0.12, 0.08, 0.08, 0.22]))
     pattern = PATTERNS[name](rng)
     angle, scale = (

@@ -166,7 +166,7 @@ def rate(step: int, steps: int) -> float:
 
 
 def validation(model: Model, alphas: Tensor, pool: Pool) -> float:
-    """The loss on fixed held-out crops, masks, noise and timesteps."""
+    """Return the loss on fixed held-out crops, masks, noise and timesteps."""
     rng = np.random.default_rng(seed_for(pool.seed, "validation"))
     with torch.no_grad():
         batch = pool.batch(rng, build.NATIVE, VALIDATION_CROPS)

@@ -1,4 +1,4 @@
-"""Scores of the reference's candidates against the truth: does the lowest misfit select the best candidate?
+"""Scores of the reference's candidates against the truth, and whether the lowest misfit selects the best candidate.
 
 Without a given reference, the stage `reference` composes several candidates from patches of the photographs, one per
 seed, and selects the one with the lowest misfit of patches. The study scores all candidates in the box of their hole,

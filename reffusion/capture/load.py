@@ -1,5 +1,4 @@
-"""Reads a scene folder in one of several layouts, such as SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or
-photographs only.
+"""Reads a scene folder in any of the layouts of `layouts/`, from SPIn-NeRF's to photographs only.
 
 Every layout is read into a `Capture`: pictures by view name and, if the folder holds poses, lenses and poses in the
 scene's own frame. Of pictures only headers are read, except for a few, whose colors are compared with the colors of

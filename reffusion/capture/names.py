@@ -1,4 +1,4 @@
-"""View names, and the search for the picture that another program means by a name or a path.
+r"""View names, and the search for the picture that another program means by a name or a path.
 
 Programs write the same picture as `A.jpg`, `images/A.jpg`, `day0\\A.jpg` or `A.jpg.png` (COLMAP's masks), and macOS
 decomposes accents. So names are compared in Unicode's NFC form with forward slashes. An *ending* is a file name's

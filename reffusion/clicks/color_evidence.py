@@ -107,8 +107,10 @@ def color_votes(
 
 
 def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray | None:
-    """Return float [H, W]: the natural logarithm of the ratio of two frequencies of each pixel's color, that among the
-    object's pixels to that among the pixels around the object.
+    """Return float [H, W], the evidence of each pixel's color that the pixel is one of the object's.
+
+    It is the natural logarithm of a ratio: the frequency of the color among the object's pixels, divided by that among
+    the pixels around the object.
 
     Args:
         image: uint8 [H, W, 3].

@@ -77,8 +77,7 @@ def value_at(mask: np.ndarray, at: np.ndarray) -> bool:
 
 
 def part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the connected part of a mask that contains a point; all False if the mask does not contain
-    the point.
+    """Return bool [H, W], the connected part of a mask that contains a point; all False if the point is outside.
 
     Args:
         at: (x, y) in pixels.

@@ -106,8 +106,9 @@ def label_gaussians(
 
 
 def object_mask(gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the object's mask in a view: the silhouette of the labelled Gaussians, with the border moved
-    to the edges of the photograph.
+    """Return bool [H, W], the object's mask in a view.
+
+    It is the silhouette of the labelled Gaussians, with the border moved to the edges of the photograph.
 
     Args:
         labels: bool [N], True = the object.

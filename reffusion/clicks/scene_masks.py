@@ -113,7 +113,6 @@ def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: 
         poses: folder of the stage `poses`, which holds the undistorted photographs.
         segmenter: the segmentation network; None for none.
     """
-
     image_of = lambda name: load_views(poses, [name])[name]
 
     @lru_cache(KEPT_VIEWS)

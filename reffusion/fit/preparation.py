@@ -129,7 +129,6 @@ def collect_points(
     Returns:
         Positions [P, 3] float64 and colors [P, 3] uint8, sparse points first.
     """
-
     points, colors = scene.points, scene.point_colors
     if params.init.flow_cell:
         flow_points, flow_colors = flow.triangulate_points(cameras, images, params.init.flow_cell)

@@ -1,5 +1,7 @@
-"""Initialization of a scene without its object: the hole is filled from references, extra views close gaps, and a refit
-corrects the result."""
+"""Initialization of a scene without its object.
+
+The hole is filled from references, extra views close gaps, and a refit corrects the result.
+"""
 
 from __future__ import annotations
 

@@ -79,8 +79,7 @@ def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]
 
 
 def invert_2x2(matrices: np.ndarray) -> np.ndarray:
-    """Return the inverses of matrices [..., 2, 2]; zeros where a matrix is singular or not finite, as for a
-    plane seen edge on."""
+    """Return the inverses of matrices [..., 2, 2]; zeros for a singular one, as of a plane seen edge on."""
     (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
     with np.errstate(invalid="ignore"):
         determinant = a * d - b * c

@@ -1,5 +1,7 @@
-"""Reading of files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz, .splat, .glb and, by
-splat-transform, .sog, .ksplat, .lcc and .lcc2.
+"""Reading of files of Gaussians.
+
+They are .ply of 3DGS and related tools, compressed .ply, .spz, .splat, .glb and, by splat-transform, .sog, .ksplat,
+.lcc and .lcc2.
 
 A row is one Gaussian of a file. Rows are read and checked in blocks, so that memory holds only one block besides the
 result.

@@ -44,8 +44,10 @@ class RenderedView(NamedTuple):
 
     @property
     def unexposed_color(self) -> np.ndarray:
-        """The picture [H, W, 3], scaled to [0, 1], with the exposure undone, so that views with different exposures can
-        be compared. Undoing the exposure may give values outside [0, 1]."""
+        """The picture [H, W, 3] without its exposure, so that views with different exposures can be compared.
+
+        Values are relative to 255; without the exposure some may be outside [0, 1].
+        """
         return undo_exposure(self.picture / 255.0, self.exposure)
 
 

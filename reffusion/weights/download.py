@@ -1,6 +1,6 @@
-"""Download of models from the Hugging Face Hub ("the hub"). Only `make weights` uses this module, and only this module
-imports huggingface_hub.
+"""Download of models from the Hugging Face Hub ("the hub"), for `make weights` alone.
 
+Only this module imports huggingface_hub.
 huggingface_hub downloads a file from its start again if the process was killed. So this module downloads large files
 itself, into the library's cache, where the library finds them. It continues partial downloads, and checks each file's
 sha256.

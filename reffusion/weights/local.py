@@ -184,8 +184,11 @@ def abbreviate_home(path: Path) -> str:
 
 
 def hub_cache() -> Path:
-    """Return the folder of the hub's cache: HF_HUB_CACHE, else `hub` below HF_HOME, else huggingface/hub below
-    the user's cache folder (XDG_CACHE_HOME, else ~/.cache)."""
+    """Return the folder of the hub's cache.
+
+    It is HF_HUB_CACHE, else `hub` below HF_HOME, else huggingface/hub below the user's cache folder (XDG_CACHE_HOME,
+    else ~/.cache).
+    """
     home = Path(os.environ.get("HF_HOME", _cache() / "huggingface"))
     return Path(os.environ.get("HF_HUB_CACHE", home / "hub")).expanduser()
 

@@ -60,8 +60,9 @@ class LpipsNet:
 
 @dataclass(frozen=True)
 class LpipsPackage:
-    """A source package of the Python Package Index with the weights of LPIPS 0.1: torchvision's convolutions and the
-    linear weights.
+    """A source package of the Python Package Index with the weights of LPIPS 0.1.
+
+    They are torchvision's convolutions and the linear weights.
 
     Attributes:
         bytes: size of the archive.

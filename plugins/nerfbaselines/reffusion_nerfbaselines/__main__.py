@@ -1,5 +1,7 @@
-"""reffusion-nerfbaselines RUN --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions
-and results, from which its own commands make demos, tables and pages."""
+"""The command `reffusion-nerfbaselines RUN --output FOLDER`: a finished run in nerfbaselines' formats.
+
+These are a checkpoint, predictions and results, from which nerfbaselines' own commands make demos, tables and pages.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ def main() -> None:
 
 
 def made(run: Path, data: Path, out: Path) -> dict[str, float]:
-    """The metrics. Writes checkpoint/, predictions/ and results/<scene>.json."""
+    """Return the metrics, and write checkpoint/, predictions/ and results/<scene>.json."""
     dataset = dataset_load_features(load(str(data), "test"))
     checkpoint(run, out / "checkpoint", dataset["metadata"])
     method = RefFusion(checkpoint=str(out / "checkpoint"))
@@ -49,7 +51,7 @@ def made(run: Path, data: Path, out: Path) -> dict[str, float]:
 
 
 def pages(results: Path, out: Path) -> None:
-    """What `nerfbaselines web build` makes of a folder of results; that command first fetches all published ones."""
+    """Build the pages of a folder of results, as `nerfbaselines web build` does after it has fetched published ones."""
     with tempfile.TemporaryDirectory() as nothing, WebBuilder(str(results), str(out), datasets=(DATASET,)) as builder:
         builder._raw_demo_params = {"mesh": {}, "demo": {}, "dataset": {}}  # what it would fetch
         builder._tmpdir_results = nothing

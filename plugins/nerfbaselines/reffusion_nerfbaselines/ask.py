@@ -34,7 +34,7 @@ def _process() -> subprocess.Popen[bytes]:
 
 
 def ask(request: str, **arrays: Any) -> dict[str, np.ndarray]:
-    """The reply of worker.py's function of that name. Raises RefFusionError with what it refuses."""
+    """Return the reply of the function of worker.py; raise `RefFusionError` with its message if it refuses."""
     process = _process()
     np.savez(buffer := io.BytesIO(), ask=request, **arrays)
     data = buffer.getvalue()

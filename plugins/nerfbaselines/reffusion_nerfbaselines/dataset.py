@@ -1,7 +1,8 @@
 """Scenes in SPIn-NeRF's layout, undistorted by RefFusion, or what its stage `poses` made of one.
 
 Masks of training views are True where a pixel may be used; those of test views are True where the object would be,
-which is where the protocol scores."""
+which is where the protocol scores.
+"""
 
 from __future__ import annotations
 

@@ -16,14 +16,20 @@ FILES = ("scene.ply", "transform.json")  # of a checkpoint, beside nerfbaselines
 
 
 def poses_of(run: Path) -> Path:
-    """What `poses` made for a run: a variant's lies with the scene's own."""
+    """Return the folder of the stage `poses` of a run; a variant uses that of its scene."""
     own = run / "poses"
     return own if own.is_dir() else run.with_name(run.name.partition("@")[0]) / "poses"
 
 
 def checkpoint(run: Path, out: Path, data: dict[str, Any]) -> None:
-    """Make a checkpoint of runs/<scene>, or runs/<scene>@<variant>, which must be finished. `data`: the data set's
-    metadata. Raises FileNotFoundError where it is not."""
+    """Make a checkpoint of a finished run, runs/<scene> or runs/<scene>@<variant>.
+
+    Args:
+        data: the data set's metadata.
+
+    Raises:
+        FileNotFoundError: the run is not finished.
+    """
     sources = {"scene.ply": run / "evaluate" / "scene.ply", "transform.json": poses_of(run) / "transform.json"}
     for name, source in sources.items():
         if not source.is_file():

@@ -27,10 +27,16 @@ from reffusion.types import Camera, Similarity
 
 
 def dataset(path: np.ndarray, split: np.ndarray, cache: np.ndarray) -> dict[str, Any]:
-    """The views of a split, undistorted as RefFusion undistorts them, cameras in the scene's own frame, and masks,
-    written to `cache`: of a test view where the object is, of a training view where it is not.
+    """Return the views of a split, undistorted as RefFusion undistorts them, with cameras in the scene's own frame.
 
-    path: a scene, or what RefFusion's stage `poses` made of one. ValueError where it is neither."""
+    Masks are written to `cache`: those of test views mark the object, those of training views the pixels beside it.
+
+    Args:
+        path: a scene, or the folder that RefFusion's stage `poses` made of one.
+
+    Raises:
+        ValueError: the path is neither.
+    """
     poses, part, out = Path(str(path)), str(split), Path(str(cache))
     if not (poses / "views.json").is_file():
         poses = _undistorted(poses, out / "poses")
@@ -90,7 +96,7 @@ def _scene(folder: str) -> tuple[Any, Similarity]:
 
 
 def render(folder: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
-    """A view of a checkpoint: color as the 8-bit picture that RefFusion scores, depth in the scene's own unit."""
+    """Render a view of a checkpoint: color as the 8-bit picture that RefFusion scores, depth in the scene's unit."""
     gaussians, similarity = _scene(str(folder))
     to_world = np.eye(4)
     to_world[:3] = pose
@@ -113,8 +119,10 @@ def _models(folder: str) -> dict[str, Any]:
 
 
 def score(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
-    """Metrics in the mask's box and 10 %; empty where the mask is. LPIPS where its weights are in the folder, or on the
-    machine."""
+    """Return the metrics in the mask's box, enlarged by 10 %; empty if the mask is empty.
+
+    LPIPS is among them if its weights are in the folder or on the machine.
+    """
     box = image_metrics.mask_box(mask.astype(bool))
     targets = image_metrics.lpips_targets(box.crop(truth), _models(str(weights))) if box else {}
     values = image_metrics.score(box.crop(image), box.crop(truth), targets) if box else {}
@@ -122,7 +130,7 @@ def score(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, weights: np.nd
 
 
 def splats(folder: np.ndarray) -> dict[str, np.ndarray]:
-    """A checkpoint's Gaussians in the scene's own frame: scales and opacities as they are, not as logarithms."""
+    """Return a checkpoint's Gaussians in the scene's own frame: scales and opacities as they are, not as logarithms."""
     gaussians, similarity = _scene(str(folder))
     return {
         "means": gaussians.means.numpy() / similarity.scale + similarity.offset,
