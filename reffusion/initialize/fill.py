@@ -115,13 +115,61 @@ def fill_reference(
         ValueError: as `unprojection.estimate_depth`.
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
-    over = reference.mask & ~mask  # an inserted object, drawn over the remaining scene
-    # New Gaussians change color with direction as their surroundings do. An inserted object does not: it has a shine
-    # of its own. An extra view is too narrow to show how colors change.
-    sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not over.any())
     hole = unprojection.find_hole(draft, reference, mask, COVERED)
     if farthest and background.mirrors:
         hole |= reference.mask  # also where the visible surface lies behind a mirror image
+    surface = estimate_surface(params, draft, reference, background, hole, disparity, log, farthest)
+    nothing = np.zeros_like(hole)
+    inserted, drawn_over, ceded = nothing, nothing, share.ceded if share else nothing
+    if inserts := bool((reference.mask & ~mask).any()):
+        is_estimated = reference.depth is not None or disparity is not None
+        surface, inserted, drawn_over = insert_object(surface, draft, reference, mask, hole, share, is_estimated)
+    print(f"depth of reference {camera.name}: {surface.words}")
+    filled = hole & ~inserted & ~ceded
+    pixels = filled | drawn_over
+    if params.overlap:  # at a step no seam has to be closed: the surface beyond it is another one
+        pixels |= dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(surface.depth)
+    # New Gaussians change color with direction as their surroundings do. An inserted object does not: it has a shine
+    # of its own. An extra view is too narrow to show how colors change.
+    sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not inserts)
+    origin = EXTRA_VIEW if farthest else REFERENCE
+    draft = unprojection.add_surface(draft, reference, surface.depth, pixels, background, sheets, origin)
+    if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
+        return Filled(draft, surface.depth)
+    views = [(each, background.masks[each.name]) for each in background.cameras]
+    gaps = unprojection.find_gaps(draft.gaussians, camera, surface.estimate, mask & ~pixels, views, GAP_ALPHA)
+    if gaps.any():
+        draft = unprojection.add_surface(draft, reference, surface.estimate, gaps, background, sheets)
+    return Filled(draft, surface.depth)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface onto which a reference is unprojected.
+
+    Attributes:
+        depth: [H, W] float64, camera z: known where the scene shows a surface, estimated in the hole.
+        estimate: [H, W] float64, the estimated depth, also where a surface is known.
+        words: how the depth was found.
+    """
+
+    depth: np.ndarray
+    estimate: np.ndarray
+    words: str
+
+
+def estimate_surface(
+    params: Params,
+    draft: Draft,
+    reference: Reference,
+    background: Background,
+    hole: np.ndarray,
+    disparity: np.ndarray | None,
+    log: Trace | None,
+    farthest: bool,
+) -> Surface:
+    """Estimate the depth of a reference in its hole, bool [H, W]; the other arguments are those of `fill_reference`."""
+    camera, mask = reference.camera, background.masks[reference.camera.name]
     # The plane sweep cannot measure depth at the rim of a gap as narrow as this.
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
@@ -134,35 +182,50 @@ def fill_reference(
     if params.depth.hints and reference.depth is None:  # a depth map that the scene provides has no ramps
         near_hole = dilate_by_distance(hole | mask | reference.mask, STEPS_MARGIN)
         depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
-    inserted = drawn_over = np.zeros_like(hole)
-    ceded = share.ceded if share else inserted
-    if over.any():
-        visible = rasterizer.render(draft.remaining, camera, sh_degree=0).depth.double().cpu().numpy()
-        behind, inserted = np.where(visible > 0, visible, depth), hole & over
-        if reference.depth is None and disparity is None:
-            upright = billboard.billboard_depth(inserted, behind, camera)
-            depth, estimate = (np.where(inserted, upright, each) for each in (depth, estimate))
-            words += f"; a billboard, good within {billboard.MAX_ANGLE_DEG} degrees, stands where the scene goes on"
-        else:
-            in_front = coverage.pixels_in_front(draft.gaussians, estimate, reference, mask)
-            back = share.drawn if share else in_front & ~hole
-            inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
-        drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
-    print(f"depth of reference {camera.name}: {words}")
-    filled = hole & ~inserted & ~ceded
-    pixels = filled | drawn_over
-    if params.overlap:  # at a step no seam has to be closed: the surface beyond it is another one
-        pixels |= dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(depth)
-    draft = unprojection.add_surface(
-        draft, reference, depth, pixels, background, sheets, EXTRA_VIEW if farthest else REFERENCE
-    )
-    if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
-        return Filled(draft, depth)
-    views = [(each, background.masks[each.name]) for each in background.cameras]
-    gaps = unprojection.find_gaps(draft.gaussians, camera, estimate, mask & ~pixels, views, GAP_ALPHA)
-    if gaps.any():
-        draft = unprojection.add_surface(draft, reference, estimate, gaps, background, sheets)
-    return Filled(draft, depth)
+    return Surface(depth, estimate, words)
+
+
+def insert_object(
+    surface: Surface,
+    draft: Draft,
+    reference: Reference,
+    mask: np.ndarray,
+    hole: np.ndarray,
+    share: Share | None,
+    is_estimated: bool,
+) -> tuple[Surface, np.ndarray, np.ndarray]:
+    """Give the object that a reference draws over the remaining scene a depth.
+
+    With a depth map or a depth model, pixels whose estimate lies in front of the scene show the object. Without them it
+    is a billboard that stands where it meets the scene.
+
+    Args:
+        surface: the reference's surface in the hole.
+        draft: the scene that is being filled.
+        reference: the completed view.
+        mask: bool [H, W], C of the view.
+        hole: bool [H, W], the pixels to fill.
+        share: as for `fill_reference`.
+        is_estimated: whether a depth map or a depth model estimated the surface.
+
+    Returns:
+        The surface with the object; bool [H, W], the object's pixels; and those of them that are added now, which are
+        not beside an edge of the depth.
+    """
+    visible = rasterizer.render(draft.remaining, reference.camera, sh_degree=0).depth.double().cpu().numpy()
+    depth, estimate, words = surface.depth, surface.estimate, surface.words
+    behind, inserted = np.where(visible > 0, visible, depth), hole & reference.mask & ~mask
+    if not is_estimated:
+        upright = billboard.billboard_depth(inserted, behind, reference.camera)
+        depth, estimate = (np.where(inserted, upright, each) for each in (depth, estimate))
+        words += f"; a billboard, good within {billboard.MAX_ANGLE_DEG} degrees, stands where the scene goes on"
+    else:
+        in_front = coverage.pixels_in_front(draft.gaussians, estimate, reference, mask)
+        back = share.drawn if share else in_front & ~hole
+        ceded = share.ceded if share else np.zeros_like(hole)
+        inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
+    drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
+    return Surface(depth, estimate, words), inserted, drawn_over
 
 
 def _gather_hints(
