@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.mask_files import NONE, find_ignore_masks, find_masks, match_masks
@@ -22,6 +23,7 @@ from reffusion.params.capture import MaskSpec
 
 LEAST_TRAINING_VIEWS = 3  # for a scene without camera-only views; with such views, one is enough
 OTHERS = "others"
+Files = TypeVar("Files", Path, tuple[Path, ...])  # one file of a view, or several
 
 
 @dataclass(frozen=True)
@@ -157,31 +159,25 @@ def load_roles(
     held_out, test_files = _split_masks(test_views, mask_files, labels or {})
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     training_masks = {thing: _restrict_files(files, {*kept, *held_out}) for thing, files in of_objects.items()}
-    for name, path in (*(item for files in training_masks.values() for item in files.items()), *test_files.items()):
+    ignored = _restrict_files(find_ignore_masks(folder, capture, ignore), {*train_named, *test_views})
+    of_views = [item for files in (*training_masks.values(), test_files) for item in files.items()]
+    for name, path in (*of_views, *((name, path) for name, paths in ignored.items() for path in paths)):
         check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
-    ignored = {
-        name: paths
-        for name, paths in find_ignore_masks(folder, capture, ignore).items()
-        if name in {*train_named, *test_views}
-    }
-    for name, path in ((name, path) for name, paths in ignored.items() for path in paths):
-        check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
+    messages = [found.warning] if found.warning else []
     unmasked = [name for name in train_named if name not in kept and name not in clean_views]
-    warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
+    if kept and unmasked:
+        messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}")
     if scored := [name for name in test_views if name in ignored]:
-        counted = f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}"
-    else:
-        counted = None
-    messages = tuple(filter(None, (found.warning, warning, counted)))
+        messages.append(f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}")
     return Roles(
-        tuple(train_named),
-        tuple(test_views),
-        clean_views,
-        training_masks,
-        test_files,
-        messages,
-        camera_only,
-        found.values,
+        train=tuple(train_named),
+        test=tuple(test_views),
+        clean=clean_views,
+        masks=training_masks,
+        test_masks=test_files,
+        warnings=tuple(messages),
+        camera_only=camera_only,
+        values=found.values,
         ignore=ignored,
     )
 
@@ -215,7 +211,7 @@ def _split_masks(
     return {name: path for name, path in held_out.items() if name not in own}, held_out | own
 
 
-def _restrict_files(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
+def _restrict_files(files: dict[str, Files], names: set[str]) -> dict[str, Files]:
     return {name: path for name, path in files.items() if name in names}
 
 

@@ -229,34 +229,35 @@ def continue_depth(
     planes = () if farthest else view.hints.planes
     label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
     surfaces = label()
-    if surfaces.max() > 1 and farthest:
-        far_disparity = _complete_gaps(view, surfaces, usable, guide, plate)
-        return np.where(
-            view.anchored, view.disparity, far_disparity
-        ), f"{description}: the farthest of {surfaces.max()} surfaces"
-    if surfaces.max() > 1:
-        layered, description = (
-            _complete_layers(view, surfaces, planes, guide, plate),
-            f"{description}: {surfaces.max()} surfaces continued",
-        )
-        # Planes that continue have a depth of their own. Other views do see "past" a mirror that is part of a plane.
-        refuted = (
-            _in_free_space(view, layered) & ~view.anchored & (surfaces != _farthest_surface(view, surfaces, usable))
-        )
-        if refuted.any():
-            layered = _complete_layers(view, label(np.where(refuted, surfaces, 0)), planes, guide, plate)
-        log.log_result("completion", layered)
-        return layered, description
+    if surfaces.max() <= 1:
+        share = view.anchored.sum() / max(view.hole.sum(), 1)
+        onward = f", planes that continue in {share:.0%} of the hole" if share else ""
+        smooth = _complete_smoothly(view, usable, guide, plate, settings, log)
+        return smooth, f"{description}: continued smoothly instead{onward}"
+    if farthest:
+        disparity = np.where(view.anchored, view.disparity, _complete_gaps(view, surfaces, usable, guide, plate))
+        return disparity, f"{description}: the farthest of {surfaces.max()} surfaces"
+    layered = _complete_layers(view, surfaces, planes, guide, plate)
+    # Planes that continue have a depth of their own. Other views do see "past" a mirror that is part of a plane.
+    is_farthest = surfaces == _farthest_surface(view, surfaces, usable)
+    refuted_pixels = _in_free_space(view, layered) & ~view.anchored & ~is_farthest
+    if refuted_pixels.any():
+        layered = _complete_layers(view, label(np.where(refuted_pixels, surfaces, 0)), planes, guide, plate)
+    log.log_result("completion", layered)
+    return layered, f"{description}: {surfaces.max()} surfaces continued"
+
+
+def _complete_smoothly(
+    view: ViewDepth, usable: np.ndarray, guide: np.ndarray, plate: Plate, settings: CompletionSettings, log: SolverLog
+) -> np.ndarray:
+    """Return disparity [H, W] that continues the pixels `usable`, bool [H, W], as one smooth surface."""
     smooth = complete(view.disparity, usable, guide, plate, keep=False)
     log.log_result("completion", smooth)
     # The bilateral solver spreads the residuals of known pixels into the hole, so that its border shows no step.
-    refined = bilateral.refine(
-        smooth, view.disparity, usable.astype(np.float64), guide, settings.solver, log.log_iteration
-    )
+    confidence = usable.astype(np.float64)
+    refined = bilateral.refine(smooth, view.disparity, confidence, guide, settings.solver, log.log_iteration)
     log.log_result("bilateral", refined, log.iterations)
-    share = view.anchored.sum() / max(view.hole.sum(), 1)
-    onward = f", planes that continue in {share:.0%} of the hole" if share else ""
-    return np.where(view.anchored, view.disparity, refined), f"{description}: continued smoothly instead{onward}"
+    return np.where(view.anchored, view.disparity, refined)
 
 
 def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray) -> int:
