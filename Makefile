@@ -199,7 +199,7 @@ gc: setup
 	@$(RUN) gc $(call flags,$(options) yes)
 
 spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
-	$(if $(filter spinnerf,$@),@$(PY) -m lab.studies.spinnerf --data="$$data")
+	$(if $(filter spinnerf,$@),@$(PY) -m lab.scenes.list_spinnerf --data="$$data")
 	@$(RUN) batch --data="$$data" $(call flags,$(filter-out scene,$(options)) $(cluster))
 
 doctor: setup

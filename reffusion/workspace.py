@@ -132,7 +132,8 @@ class Workspace:
     def remove_object(self, name: str) -> np.ndarray:
         """Return a view without the object, uint8 [H, W, 3].
 
-        Outside C this is the photograph, inside C a rendering of the remaining Gaussians.
+        Outside C this is the photograph without the object's soft shadow, inside C a rendering of the remaining
+        Gaussians.
         """
         photo = self.load_photos([name])[name]
         return inpaint.composite_background(

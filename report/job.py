@@ -165,6 +165,9 @@ def whole_job_section(job: JobFiles, out: Path) -> list[str]:
 def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
     """Draw the PSNR and the stages of a job against seconds into the PNG `path`.
 
+    Curves are those of the stages' traces. Points are means over the test views in the box of the object, of the
+    initialization and of the result. Below them each stage's time is a bar.
+
     Args:
         ceiling: PSNR in dB of a dashed line, see `trace_charts.draw_job_chart`.
     """

@@ -22,8 +22,9 @@ MACHINE = platform.node()
 def list_files(folder: Path) -> Iterator[Path]:
     """Yield the paths of all files below a folder, each beginning with `folder`; nothing if there is no such folder.
 
-    The files of a folder come first, sorted by name, and then those of its subfolders. Links are followed. Hidden files
-    and folders, __pycache__ and broken links are left out.
+    The files of a folder come first, sorted by name, and then those of its subfolders. Links are followed; a folder
+    that a link reaches again yields its own files, but not those of its subfolders. Hidden files and folders,
+    __pycache__ and broken links are left out.
 
     Raises:
         Refused: there is a pipe or a device.

@@ -45,14 +45,16 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
     Writes:
 
-    - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
+    - labels.npy, bool [N]: the Gaussians to remove: the object's, parts of it that no mask covers and that would float,
+      and debris;
     - debris.npy, bool [N]: Gaussians that the object had hidden and that no photograph supports (all False unless
       debris is searched), and scattered ones that a user deleted in an editor;
     - background.npz: planes and mirror planes around the object if the classes depend on them, and its soft shadow if
       one is found;
     - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
     - facts.json;
-    - warnings.json and remnants/<number>.png, if the masks seem to leave out parts of the object.
+    - warnings.json, if the masks seem to leave out parts of the object (drawn in remnants/<number>.png), or if splats
+      stay in or behind a hole that a user cut in an editor.
 
     Args:
         out: folder of this stage.

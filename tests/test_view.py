@@ -26,7 +26,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Similarity
 from report import gaussian_layers, unseen_overlay, view
 from report.access import REFUSAL, Access
-from report.app import live
+from report.app import viewer_process
 
 pytestmark = pytest.mark.integration
 
@@ -130,7 +130,7 @@ def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path, monkeypatch):
     for stage in ("initialize", "distill", "evaluate"):
         shutil.rmtree(home / stage)
     (home / "masks/labels.npy").rename(tmp_path / "labels.npy")
-    opened = live.LatestViewer(home, 8350, Access(8350))
+    opened = viewer_process.LatestViewer(home, 8350, Access(8350))
     try:
         wait_until(lambda: opened.gaussians is not None)
         assert len(opened.gaussians) == len(gaussians) and "with the object" in opened.title.content
@@ -138,8 +138,8 @@ def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path, monkeypatch):
         os.utime(home / "masks/labels.npy")
         wait_until(lambda: "without the object" in opened.title.content)
         assert len(opened.gaussians) == int((~labels).sum())
-        find, vanished = live.find_latest, iter([FileNotFoundError(), FileNotFoundError()])
-        monkeypatch.setattr(live, "find_latest", lambda home: raise_next(vanished) or find(home))
+        find, vanished = viewer_process.find_latest, iter([FileNotFoundError(), FileNotFoundError()])
+        monkeypatch.setattr(viewer_process, "find_latest", lambda home: raise_next(vanished) or find(home))
         save_ply(home / "initialize/gaussians.ply", gaussians.map(lambda p: p[:5]))
         wait_until(lambda: "before distillation" in opened.title.content)
         assert len(opened.gaussians) == 5

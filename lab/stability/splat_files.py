@@ -49,10 +49,11 @@ def fold_filter_exactly(log_scale: float, size: float, logit: float) -> tuple[fl
         return float((square + filter_).ln() / 2), float(opacity.ln()), float((1 - opacity).ln())
 
 
-def filter_error() -> float:
-    """Return the largest error of folded log-scales and of the logarithms of opacities o and of 1 - o.
+def fold_filter_error() -> float:
+    """Return the largest error of `fold_filter` against `fold_filter_exactly`, over all values of this module.
 
-    Each error is divided by 1 + the size of the exact value.
+    Compared are log-scales and, with opacities o, log o and log(1 - o). Each error is divided by 1 + the size of the
+    exact value.
     """
     errors = []
     for log_scale in LOG_SCALES:
@@ -158,7 +159,7 @@ def spz_error(extent: float) -> float:
 CASES = (
     # A rounding of log(size) is 2^-53 of up to 70, twice that in the exponent, thrice in the product over axes.
     Case("filter_3D, sizes from 0 to 1e8, scales e-40 to e40", "worst error of a logarithm, over 1 + its size",
-         2 * 3 * 70 * EPS64, filter_error),
+         2 * 3 * 70 * EPS64, fold_filter_error),
     Case("filter_3D with infinite logits and flat axes", "values that are not finite, and rows lost", EXACT,
          count_invalid_rows),
     # Clamping changes the opacity by e^-20 = 2e-9 and an axis by 2e-9 extents. Both are below a rounding of float32 in

@@ -411,7 +411,10 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def main() -> None:
+    """Run the parts that are asked for. The pictures of an earlier run in --out are deleted."""
     arguments = parse_arguments()
+    if (arguments.out / "poses").is_dir():
+        raise ValueError(f"{arguments.out} is the folder of a job; name another folder for --out")
     torch.set_num_threads(arguments.threads)
     for folder in ("inpainting", "photographs", "reference", "whole", "window"):
         shutil.rmtree(arguments.out / folder, ignore_errors=True)

@@ -23,7 +23,7 @@ from reffusion.io.scene import load_views
 from reffusion.params.clicks import Clicked
 from reffusion.types import Camera, Gaussians, Scene
 
-KEPT_VIEWS = 96  # number of views whose network features stay in memory, 4 MB each
+KEPT_VIEWS = 96  # views that stay in memory: network features, 4 MB each; photograph and relief, 11 bytes a pixel
 
 
 def masks_from_clicks(
@@ -103,7 +103,9 @@ def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np
     return found
 
 
-def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: Segmenter | None):
+def evidence_loader(
+    scene: Scene, gaussians: Gaussians, poses: Path, segmenter: Segmenter | None
+) -> Callable[[str], ViewEvidence]:
     """Return a function from a view's name to its ViewEvidence.
 
     The function loads the view's photograph and renders its relief at the first call. The segmentation network encodes

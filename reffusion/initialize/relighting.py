@@ -9,7 +9,7 @@ import numpy as np
 
 from reffusion.background.model import Background
 from reffusion.background.visibility import with_photographed_depth
-from reffusion.masks import shadows
+from reffusion.masks import reference_shadows
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Reference
@@ -43,7 +43,7 @@ def remove_shadows(
         name = each.camera.name
         mask = background.masks[name]
         view = inpaint.composite_background(gaussians, each.camera, photos[name], mask)
-        shadow = shadows.detect_shadows(each.image, view, mask)
+        shadow = reference_shadows.detect_shadows(each.image, view, mask)
         if (each.mask & ~mask).any():  # an inserted object and its rim differ too, but are no shadow
             shadow &= mask
         extended.append(replace(each, mask=each.mask | shadow))
@@ -52,10 +52,10 @@ def remove_shadows(
         print(f"reference {name}: beside the hole {shadow.sum()} px differ from what is seen, a shadow perhaps")
         depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
         depth = with_photographed_depth(depth, each.camera, background.views)
-        light = shadows.log_light(each.image, view)
-        projected = shadows.project_shadow(shadow, light, depth, each.camera, background.views)
+        light = reference_shadows.log_light(each.image, view)
+        projected = reference_shadows.project_shadow(shadow, light, depth, each.camera, background.views)
         for other, (pixels, own_light) in projected.items():
-            photos[other] = shadows.relight(photos[other], own_light)
+            photos[other] = reference_shadows.relight(photos[other], own_light)
             found[other] = found[other] | pixels
             unknown[other] = unknown[other] | (pixels & np.isnan(own_light).any(-1))
     if not any(pixels.any() for pixels in found.values()):

@@ -30,7 +30,8 @@ def load_inpainter(inpainter: Inpainter, device: str = "cpu") -> Painter | None:
         device: runs TorchScript files (.pt, LaMa only). ONNX files (.onnx) run on the CPU.
 
     Returns:
-        None for the kinds that need more than an image and a hole: "exemplar" needs the scene, "diffusion" the prior.
+        None for the kinds that need more than an image and a hole: "exemplar" needs the scene, "diffusion" the prior,
+        and those of `SEED_KINDS` a seed.
 
     Raises:
         ValueError: the file is missing, is not the only one, or is of another kind; or onnxruntime is missing.

@@ -118,8 +118,10 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
             save_splat(path, rows)
     elif name.endswith(".compressed.ply"):
         compressed.save_compressed(path, gaussians, similarity)
-    else:
+    elif name.endswith(".ply"):
         save_ply(path, gaussians, similarity, properties)
+    else:
+        raise ValueError(f"{path}: Gaussians are written as {', '.join(FORMATS)}")
 
 
 def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cpu") -> Gaussians:

@@ -242,7 +242,11 @@ def load_columns(typing, array, width, column, row, last, columns, place):
 
 @intrinsic
 def store_columns(typing, array, width, column, row, columns, place):
-    """Write a block of LANES rows and LANES columns from `columns`, the inverse of `load_columns`."""
+    """Write LANES columns, stored one after the other in `columns` from `place` on, to a block of an array [R, width].
+
+    It is the inverse of `load_columns` without the limit `last`: the array must have all rows from `row` to `row` +
+    LANES - 1.
+    """
 
     def emit(context, builder, sig, args):
         source = _pointer(context, builder, (sig.args[4], args[4]), (sig.args[5], args[5]))

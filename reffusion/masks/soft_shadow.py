@@ -24,7 +24,7 @@ from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.background.plane import Plane
 from reffusion.inpaint.plane_frames import label_planes
-from reffusion.masks.shadows import DARK_OFFSET, relight
+from reffusion.masks.reference_shadows import DARK_OFFSET, relight
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 

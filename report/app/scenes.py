@@ -110,7 +110,12 @@ def _find_lost(text: str, runs: Path) -> Path | None:
 
 
 def list_recent(runs: Path) -> list[dict[str, object]]:
-    """Return the scenes of data/ and runs/, the latest first.
+    """Return the `MAX_RECENT` scenes that changed last: those that ran in `runs`, and captures and videos of data/.
+
+    Variants of a scene are left out.
+
+    Args:
+        runs: the folder of all runs.
 
     Returns:
         For each scene "name", "path", "state" ("finished", "begun" or "new") and "lost", which is True if the

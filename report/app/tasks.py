@@ -66,7 +66,7 @@ READY = "ready"  # the line that the process of the viewer prints when it listen
 
 
 class Viewer:
-    """The 3D viewer (report/app/live.py) as a process of its own, for one scene at a time.
+    """The 3D viewer (report/app/viewer_process.py) as a process of its own, for one scene at a time.
 
     Args:
         runs: folder of all results.
@@ -95,7 +95,13 @@ class Viewer:
             alive = self.process is not None and self.process.poll() is None
             if not (alive and (self.scene, self.follows) == (scene.name, follow)):
                 self._stop()
-                words = ("-m", "report.app.live", str(scene.home), str(self.port), "latest" if follow else "finished")
+                words = (
+                    "-m",
+                    "report.app.viewer_process",
+                    str(scene.home),
+                    str(self.port),
+                    "latest" if follow else "finished",
+                )
                 self.process = subprocess.Popen(
                     [sys.executable, *words],
                     env=make_environment(),

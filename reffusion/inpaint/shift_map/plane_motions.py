@@ -55,9 +55,14 @@ def fill_plane(
     Args:
         target: the view; its image is read outside the hole only, its geometry everywhere.
         hole: bool [H, W], the pixels to fill; those on other planes stay unfilled.
-        sources: photographs, of which the view's own is the first.
+        sources: photographs. The first of them that shows enough of the plane, usually the view's own, is preferred.
         plane: index of the plane in the sources and the target.
         symmetry: how the texture of the plane repeats itself.
+
+    Returns:
+        The target's picture with these pixels filled, the filled pixels, and the cost. No pixel is filled, at a cost
+        of 0, if no photograph shows enough of the plane, if too little of it is known around the hole, or if no motion
+        suits.
     """
     nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
     on_plane = _without_specks(target.plane == plane)

@@ -1,4 +1,4 @@
-"""Print a line for each of SPIn-NeRF's scenes in a folder: `python -m lab.studies.spinnerf --data FOLDER`.
+"""Print a line for each of SPIn-NeRF's scenes in a folder: `python -m lab.scenes.list_spinnerf --data FOLDER`.
 
 A line has the numbers of views and the parts that the scene lacks, or says that a published scene is missing.
 """

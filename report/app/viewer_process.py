@@ -1,4 +1,4 @@
-"""The 3D viewer of the page, as a process: `python -m report.app.live HOME PORT latest|finished`.
+"""The 3D viewer of the page, as a process: `python -m report.app.viewer_process HOME PORT latest|finished`.
 
 `finished` shows the finished scene, as `reffusion view` does. `latest` shows the latest state of a job, also of one
 that runs, and reloads when there is a newer state. The first line of its standard input has the port and the token of
@@ -102,6 +102,7 @@ class LatestViewer:
 
 
 def main() -> None:
+    """Serve the 3D view until standard input closes."""
     home, port, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     page, token = sys.stdin.readline().split()
     access = Access(int(page), token)
