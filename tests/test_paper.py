@@ -237,7 +237,7 @@ def test_constants_of_the_library():
 
     import torch
 
-    from lab.gpu import full_size
+    from lab.gpu import random_priors
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.metrics import image_metrics
     from reffusion.params.base import Prompts
@@ -245,7 +245,7 @@ def test_constants_of_the_library():
 
     assert Prompts().texts == ["A photo of sks", "A photo of sks, cropped", ""]
     assert image_metrics.BOX_DILATION == 0.1
-    assert 8 * full_size.SD2.unet["sample_size"] == 512
+    assert 8 * random_priors.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}
     # The loss is 0.8 L1 + 0.2 (1 - SSIM). A black and a white picture have an L1 of 1 and an SSIM of almost 0.

@@ -20,7 +20,7 @@ from scenes.networks import small_depth_model
 from scenes.simulated_gpu import has_gpu
 from test_paper import DOC, parse_rows
 
-from lab.gpu import full_size
+from lab.gpu import random_priors
 from reffusion.depth import monocular
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image
@@ -137,8 +137,8 @@ def run_of_paper(tmp_path_factory):
     """Run all stages; return a dict from stage to its output folder, and the modules of reffusion/ that did work."""
     home, ran = tmp_path_factory.mktemp("paper"), set()
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
-    for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
-        prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
+    for name, shape in (("sd2", random_priors.SD2), ("sdxl", random_priors.SDXL)):
+        prior = random_priors.build_prior(random_priors.shrink(shape), torch.float32)
         pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)
     network_that_sees_the_tilt().save_pretrained(home / "depth")
     wall_scene.write_poses_and_fit(home, 1.5)

@@ -17,6 +17,7 @@ import torch
 from lab.gpu import check as gpu_check
 from lab.gpu import exact as gpu_exact
 from lab.gpu import full_size as F
+from lab.gpu import random_priors
 from lab.gpu import steps as gpu_steps
 from reffusion.params.base import Prompts
 from reffusion.prior import denoising, diffusion, inpaint, lora, memory
@@ -34,7 +35,9 @@ ROOT = Path(__file__).resolve().parent.parent
 def sdxl_folder(tmp_path_factory):
     """Return a folder that diffusers wrote, with a small prior with the architecture of SDXL."""
     folder = tmp_path_factory.mktemp("sdxl")
-    pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
+    pipeline(
+        replace(random_priors.build_prior(random_priors.shrink(random_priors.SDXL), torch.float32), zero_empty=True)
+    ).save_pretrained(folder)
     return folder
 
 
@@ -45,7 +48,7 @@ def sdxl_prior(sdxl_folder):
 
 @pytest.fixture
 def sd2_prior():
-    return F.build_prior(F.shrink(F.SD2), torch.float32)
+    return random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32)
 
 
 def draw_normal(*shape, seed=0):
@@ -135,7 +138,7 @@ def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2_prior):
 def test_a_training_step_in_parts_is_the_same_step():
     after = []
     for rows in (0, 2):
-        prior = F.build_prior(F.shrink(F.SD2), torch.float32)
+        prior = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32)
         trained, optimizer, training = F.trainer(prior, 5)
         for part in (prior.unet, prior.text_encoder):  # no dropout: its random draws depend on the split into parts
             for layer in part.modules():
@@ -151,7 +154,7 @@ def test_a_training_step_in_parts_is_the_same_step():
 
 
 def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
-    half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
+    half = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.bfloat16)
     for name in ("unet", "text_encoder"):
         getattr(half, name).load_state_dict(getattr(sd2_prior, name).state_dict())
     half.vae.load_state_dict(sd2_prior.vae.state_dict())
@@ -173,7 +176,7 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
 
 @pytest.mark.parametrize("dropout", [0.0, 0.1])
 def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
-    half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
+    half = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.bfloat16)
     half.unet.load_state_dict(sd2_prior.unet.state_dict())
     sd2_prior.unet.load_state_dict(half.unet.state_dict())  # equal weights: both rounded to bfloat16
     noisy, condition, at, text = (
@@ -209,7 +212,7 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2_prior, tmp_path):
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
     trained, words = F.epsilon(sd2_prior), diffusion.embed_text(sd2_prior, [Prompts().whole])
     lora.save(sd2_prior, tmp_path)
-    fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
+    fresh = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32)
     pipe = pipeline(fresh)
     pipe.load_lora_weights(tmp_path)
     lora.set_dropout(fresh, False)  # turn dropout off, as new layers are in training mode
@@ -226,15 +229,17 @@ def test_the_order_of_weights_in_memory_changes_nothing(sd2_prior, tmp_path):
     before = F.epsilon(sd2_prior)
     sd2_prior.unet.to(memory_format=torch.channels_last)
     assert (F.epsilon(sd2_prior) - before).abs().max() < 1e-5
-    F.personalization_step(F.build_prior(F.shrink(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
-    fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
+    F.personalization_step(
+        random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32), F.reference(32), 1, tmp_path
+    )
+    fresh = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32)
     fresh.unet.to(memory_format=torch.channels_last)
-    plain = lora.merge(F.build_prior(F.shrink(F.SD2), torch.float32), tmp_path)
+    plain = lora.merge(random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32), tmp_path)
     assert (F.epsilon(lora.merge(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
 
 
 def test_the_text_encoder_is_let_go():
-    prior = F.build_prior(F.shrink(F.SD2), torch.float32)
+    prior = random_priors.build_prior(random_priors.shrink(random_priors.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
     text = diffusion.embed_text(prior, Prompts().texts).detach()
     prior = drop_text_encoders(prior)
@@ -301,14 +306,14 @@ def test_running_out_of_memory_names_the_param():
 
 
 def test_published_sizes_are_those_of_the_published_configurations():
-    assert F.count_parameters(F.SD2) == published.PUBLISHED[published.SD2].parameters
-    assert F.count_parameters(F.SDXL) == published.PUBLISHED[published.SDXL].parameters
+    assert random_priors.count_parameters(random_priors.SD2) == published.PUBLISHED[published.SD2].parameters
+    assert random_priors.count_parameters(random_priors.SDXL) == published.PUBLISHED[published.SDXL].parameters
 
 
 def test_memory_is_counted_without_computing():
-    shape = F.shrink(F.SD2)
+    shape = random_priors.shrink(random_priors.SD2)
     counted = F.peak_memory(shape, torch.float32)
-    made = F.build_prior(shape, torch.float32)
+    made = random_priors.build_prior(shape, torch.float32)
     assert counted["weights"] == pytest.approx(made.bytes / 1e9, abs=1e-6)
     real = memory.peak_bytes(lambda: memory.encode_one_sample(made), "cpu") / 1e9
     assert real <= counted["SDS"] < 2 * real  # the count decomposes attention, which needs more memory

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lab.gpu import full_size
+from lab.gpu import full_size, random_priors
 from reffusion.params.distill import AdversarialTerm
 from reffusion.prior import memory
 from reffusion.prior.model import Prior, load_prior
@@ -45,13 +45,13 @@ class Sizes:
     views: int
     repeats: int
     critic: AdversarialTerm
-    shape: full_size.Shape
+    shape: random_priors.Shape
     oracle: tuple[int, int] = (400, 200)
 
 
-PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, AdversarialTerm(), full_size.SD2)  # 1600 x 1280 px
+PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, AdversarialTerm(), random_priors.SD2)  # 1600 x 1280 px
 TOY = Sizes(
-    40, 300, 2, 4, 3, 1, AdversarialTerm(patches=8, size=8, width=8), full_size.shrink(full_size.SD2), (100, 70)
+    40, 300, 2, 4, 3, 1, AdversarialTerm(patches=8, size=8, width=8), random_priors.shrink(random_priors.SD2), (100, 70)
 )
 
 
@@ -82,10 +82,10 @@ class Bench:
             self._prior = None
             gc.collect()
             dtype, shape = getattr(torch, half if self.device == "cuda" else "float32"), self.sizes.shape
-            if shape == full_size.SD2 and local.locate(published.SD2) is not None:
+            if shape == random_priors.SD2 and local.locate(published.SD2) is not None:
                 self._prior = half, load_prior(published.SD2, self.device, dtype), published.SD2
             else:
-                self._prior = half, full_size.build_prior(shape, dtype, self.device), "random"
+                self._prior = half, random_priors.build_prior(shape, dtype, self.device), "random"
         return self._prior[1], self._prior[2]
 
     def forget_prior(self) -> None:

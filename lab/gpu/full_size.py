@@ -1,8 +1,8 @@
 """One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
 
-The configurations below are the published ones; the steps are those of the library. The script also compares the noise
-(epsilon) that the trained model predicts with that of a fresh model of the same weights, into which the saved LoRA is
-merged. It reports the largest difference, which should be rounding only.
+The configurations are the published ones (`random_priors`); the steps are those of the library. The script also
+compares the noise (epsilon) that the trained model predicts with that of a fresh model of the same weights, into which
+the saved LoRA is merged. It reports the largest difference, which should be rounding only.
 
     python -m lab.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
 """
@@ -14,145 +14,48 @@ import gc
 import json
 import resource
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from lab.gpu.random_priors import SD2, Shape, assemble_prior, build_prior, count_parameters, networks, shrink
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
 from reffusion.params.base import Prompts
 from reffusion.params.distill import SdsTerm
 from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
-from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, make_prior
+from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing
 from reffusion.prior.personalize import WEIGHT_DECAY, train_step
 from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
 from reffusion.weights import published
 
-TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
+
+def reference(size: int) -> crops.Picture:
+    """Make a reference of `size` px height, a quarter wider than high: stripes, with a hole in the middle."""
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size + size // 4), indexing="ij")
+    image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
+    hole = torch.zeros(rows.shape, dtype=torch.bool)
+    hole[size // 3 : 2 * size // 3, size // 2 : size] = True
+    return crops.make_picture(image.to(torch.uint8), hole, size)
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Configuration of a diffusion prior, as arguments of the classes of diffusers and transformers.
+def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
+    """Attach the paper's LoRA to a prior (rank 8, alpha 16, dropout 0.1, attention layers), and make AdamW for it.
 
-    Attributes:
-        unet: configuration of the UNet.
-        vae: configuration of the VAE.
-        texts: configurations of the text encoders: one, or two for SDXL.
+    The prior is changed in place.
+
+    Returns:
+        The trained parameters of "unet" and "text", the optimizer, and the parameters of the stage `personalize`.
     """
-
-    unet: dict[str, Any]
-    vae: dict[str, Any]
-    texts: tuple[dict[str, Any], ...]
-
-
-_VAE = {
-    "block_out_channels": (128, 256, 512, 512),
-    "down_block_types": ("DownEncoderBlock2D",) * 4,
-    "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "layers_per_block": 2,
-    "latent_channels": 4,
-    "norm_num_groups": 32,
-}
-_CLIP = {"vocab_size": 49408, "max_position_embeddings": 77}
-
-SD2 = Shape(
-    unet={
-        "sample_size": 64,
-        "in_channels": 9,
-        "out_channels": 4,
-        "block_out_channels": (320, 640, 1280, 1280),
-        "down_block_types": ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
-        "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
-        "layers_per_block": 2,
-        "cross_attention_dim": 1024,
-        "attention_head_dim": (5, 10, 20, 20),
-        "use_linear_projection": True,
-    },
-    vae=_VAE | {"sample_size": 512, "scaling_factor": 0.18215},
-    texts=(
-        _CLIP
-        | {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 23, "num_attention_heads": 16}
-        | {"hidden_act": "gelu", "projection_dim": 512},
-    ),
-)
-SDXL = Shape(
-    unet={
-        "sample_size": 128,
-        "in_channels": 9,
-        "out_channels": 4,
-        "block_out_channels": (320, 640, 1280),
-        "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
-        "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D"),
-        "layers_per_block": 2,
-        "transformer_layers_per_block": (1, 2, 10),
-        "cross_attention_dim": 2048,
-        "attention_head_dim": (5, 10, 20),
-        "use_linear_projection": True,
-        "addition_embed_type": "text_time",
-        "addition_time_embed_dim": 256,
-        "projection_class_embeddings_input_dim": 2816,
-    },
-    vae=_VAE | {"sample_size": 1024, "scaling_factor": 0.13025},
-    texts=(
-        _CLIP
-        | {"hidden_size": 768, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 12}
-        | {"hidden_act": "quick_gelu", "projection_dim": 768},
-        _CLIP
-        | {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 20}
-        | {"hidden_act": "gelu", "projection_dim": 1280},
-    ),
-)
-
-
-def shrink(shape: Shape) -> Shape:
-    """Return a configuration with the same kinds of layers but few channels, at 32 px, which runs in milliseconds."""
-    second = len(shape.texts) == 2
-    depth = len(shape.unet["block_out_channels"])
-    unet = shape.unet | {"sample_size": 16, "block_out_channels": (32, 64, 64, 64)[:depth], "cross_attention_dim": 64}
-    unet |= {"attention_head_dim": (2, 4, 4, 4)[:depth], "layers_per_block": 1, "norm_num_groups": 8}
-    if second:
-        unet |= {"cross_attention_dim": 96, "transformer_layers_per_block": (1, 1, 2), "addition_time_embed_dim": 8}
-        unet |= {"projection_class_embeddings_input_dim": 32 + 6 * 8}
-    vae = {"block_out_channels": (16, 16), "layers_per_block": 1, "norm_num_groups": 8, "sample_size": 32}
-    vae |= {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
-    small = {"intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
-    tiny = json.loads((TINY / "text_encoder/config.json").read_text())  # whose tokenizer the small models share
-    small |= {key: tiny[key] for key in ("vocab_size", "max_position_embeddings", "bos_token_id", "eos_token_id")}
-    widths = (64, 32) if second else (64,)
-    texts = tuple(t | small | {"hidden_size": w, "projection_dim": w} for t, w in zip(shape.texts, widths, strict=True))
-    return Shape(unet, shape.vae | vae, texts)
-
-
-def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
-    """Create the networks of a prior on torch's default device: UNet and text encoders in `dtype`, the VAE in float32.
-
-    On the device `meta` nothing is allocated or computed, only counted.
-    """
-    from diffusers import AutoencoderKL, UNet2DConditionModel
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
-
-    kinds = (CLIPTextModel, CLIPTextModelWithProjection)
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        models = {"unet": UNet2DConditionModel(**shape.unet)}
-        for name, kind, text in zip(("text_encoder", "text_encoder_2"), kinds, shape.texts, strict=False):
-            models[name] = kind(CLIPTextConfig(**text))
-    finally:
-        torch.set_default_dtype(before)
-    return models | {"vae": AutoencoderKL(**shape.vae)}
-
-
-def count_parameters(shape: Shape) -> int:
-    """Return the number of parameters of all networks, without allocating them."""
-    with torch.device("meta"):
-        return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
+    training = Params(optimizer=Optimizer(batch=batch))
+    chosen, rates = training.lora, training.optimizer
+    trained = lora.attach(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
+    groups = [{"params": trained["unet"], "lr": rates.lr_unet}, {"params": trained["text"], "lr": rates.lr_text}]
+    return trained, torch.optim.AdamW(groups, betas=rates.betas, weight_decay=WEIGHT_DECAY), training
 
 
 def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
@@ -178,68 +81,6 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     sizes["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encode_one_sample(prior), "meta")
     sizes["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
     return {name: round(count / 1e9, 6) for name, count in sizes.items()}
-
-
-def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
-    """Make a prior with random weights on a device; equal seeds give equal weights on the same device."""
-    with torch.random.fork_rng(), torch.device(device):
-        torch.manual_seed(seed)
-        models = networks(shape, dtype)
-    return assemble_prior(shape, models, device)
-
-
-def assemble_prior(shape: Shape, models: dict[str, torch.nn.Module], device: str) -> Prior:
-    """Make a prior from networks, with the embedded prior's tokenizer and SD2's noise schedule.
-
-    The tokenizer does not matter here, because the weights are random.
-    """
-    from diffusers import DDIMScheduler
-    from transformers import CLIPTokenizer
-
-    length = shape.texts[0]["max_position_embeddings"]
-    tokens = CLIPTokenizer.from_pretrained(TINY / "tokenizer", model_max_length=length)
-    schedule = DDIMScheduler(
-        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
-    )
-    second = models.get("text_encoder_2")
-    return make_prior(
-        models["unet"],
-        models["vae"],
-        models["text_encoder"],
-        tokens,
-        schedule,
-        device,
-        "random weights",
-        second,
-        tokens,
-    )
-
-
-# ------------------------------------------------------------------------------------------------------- the two steps
-
-
-def reference(size: int) -> crops.Picture:
-    """Make a reference of `size` px height, a quarter wider than high: stripes, with a hole in the middle."""
-    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size + size // 4), indexing="ij")
-    image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
-    hole = torch.zeros(rows.shape, dtype=torch.bool)
-    hole[size // 3 : 2 * size // 3, size // 2 : size] = True
-    return crops.make_picture(image.to(torch.uint8), hole, size)
-
-
-def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
-    """Attach the paper's LoRA to a prior (rank 8, alpha 16, dropout 0.1, attention layers), and make AdamW for it.
-
-    The prior is changed in place.
-
-    Returns:
-        The trained parameters of "unet" and "text", the optimizer, and the parameters of the stage `personalize`.
-    """
-    training = Params(optimizer=Optimizer(batch=batch))
-    chosen, rates = training.lora, training.optimizer
-    trained = lora.attach(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
-    groups = [{"params": trained["unet"], "lr": rates.lr_unet}, {"params": trained["text"], "lr": rates.lr_text}]
-    return trained, torch.optim.AdamW(groups, betas=rates.betas, weight_decay=WEIGHT_DECAY), training
 
 
 def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:

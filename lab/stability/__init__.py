@@ -20,6 +20,7 @@ SUBJECTS = (
     "alignment",
     "solvers",
     "diffusion",
+    "critic",
     "metric_cases",
     "optimisation",
     "splat_files",
