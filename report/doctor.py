@@ -45,11 +45,16 @@ NAMES = {
     "sdxl": "SDXL",
 }
 PRIORS = {"embedded": EMBEDDED, "sd2": SD2, "sdxl": SDXL}
+FETCHED_BY = {  # inpainter -> command that fetches its weights
+    **dict.fromkeys(PAINTERS, "make weights"),
+    "moebius": "make weights painter=moebius",
+    **dict.fromkeys(("sd2", "sdxl"), "make weights profile=paper"),
+}
+ABSENT = "is not on this machine"  # in the problem of a model that was not fetched
 LEAST_CONTRAST = 1.0  # of 255: standard deviation of the colors in the hole, below which it is one color
 LEAST_CHANGE = 4.0  # of 255: mean difference from the input in the hole, below which nothing was painted
-MOST_SEAM = (
-    0.1  # by which the color step across the hole's border may exceed that of the true picture, colors in [-1, 1]
-)
+# By how much the color step across the hole's border may exceed that of the true picture; colors are in [-1, 1].
+MOST_SEAM = 0.1
 
 
 class Case(NamedTuple):
@@ -90,8 +95,10 @@ def find_problem(key: str) -> str | None:
         return None
     if key in PRIORS:
         source = root() / EMBEDDED if key == "embedded" else PRIORS[key]
-        return local.model_need(source, "float32").problem
-    return painters.reference_needs(Inpainter(kind=key), "float32")[0].problem
+        problem = local.model_need(source, "float32").problem
+    else:
+        problem = painters.reference_needs(Inpainter(kind=key), "float32")[0].problem
+    return f"`{FETCHED_BY[key]}` fetches it" if problem and ABSENT in problem and key in FETCHED_BY else problem
 
 
 def find_revision(key: str) -> str:
