@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import make_camera
 
-from lab.studies import exact_prior
+from lab.studies import exact_prior, personalized
+from reffusion.distill.train_view import TrainView
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import load_prior
 from reffusion.seeding import generator
@@ -73,3 +75,17 @@ def test_fillings_keep_what_is_known(pictures):
     both_ways = 2 * len(random)  # donors, flipped or not
     assert len({each.sum().item() for each in found}) == exact_prior.CLOSE + exact_prior.DISPLACED + both_ways
     assert load_prior(exact_prior.TINY).native_size == SIZE
+
+
+def test_the_prior_that_knows_the_reference_predicts_unseen_views_better(pictures, exact):
+    (fillings, hole), (prior, text) = pictures, exact
+    photo, pairs = torch.zeros(HEIGHT, WIDTH, 3), []
+    for view in range(VIEWS):
+        camera = make_camera(f"a{view}", (WIDTH, HEIGHT), 100.0)
+        pairs.append((TrainView(camera, photo, ~hole, hole, clean=False), fillings[view, 0]))
+    errors = []
+    for prior.unet.personalized in (True, False):
+        errors.append(personalized.measure_errors(prior, text, pairs))
+    assert (errors[0] < 0.5 * errors[1]).all()  # three close fillings of fifty
+    table = personalized.tabulate({"room": np.array([errors[0] / errors[1]] * 2)})
+    assert f"{errors[0][0] / errors[1][0]:.3f}" in table.splitlines()[2]
