@@ -27,6 +27,7 @@ def test_the_makefiles_command_is_understood(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py", *command[3:-2], "--steps", "5"])
     options = train.arguments()
     assert options.steps == 5 and (ROOT / options.start / "model_index.json").exists()
+    assert options.out == TINY and options.work == ROOT / "runs" / "prior"
 
 
 def test_images_depend_on_seed_and_number_only():

@@ -253,7 +253,7 @@ def main() -> None:
     (options.out / "full_size.json").write_text(json.dumps(report, indent=1) + "\n")
     if not options.toy and report["parameters"] != published.PUBLISHED[published.SD2].parameters:
         raise SystemExit(
-            f"error: reffusion/weights/local.py states another number of parameters: {report['parameters']}"
+            f"error: reffusion/weights/published.py states another number of parameters: {report['parameters']}"
         )
 
 

@@ -1,8 +1,8 @@
 """Train the embedded prior: `python -m lab.prior.train --steps 20000` (or `make prior`).
 
 Resumable and seeded: step k draws its images, masks, noise and timesteps from (seed, k) alone, so an interrupted run
-continues as the unbroken one would. The folder this file stands in receives an ordinary diffusers inpainting pipeline
-in half precision, averaged over the last steps (EMA).
+continues as the unbroken one would. `priors/tiny` (--out) receives an ordinary diffusers inpainting pipeline in half
+precision, averaged over the last steps (EMA).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from reffusion.prior.model import CONDITIONING
 from reffusion.seeding import generator, seed_for
 from reffusion.trace import load_checkpoint, save_checkpoint
 
-HERE = Path(__file__).resolve().parent
+ROOT = Path(__file__).resolve().parents[2]
 
 POOL = 500  # images held in memory
 STEPS_PER_IMAGE = 2  # steps per new image, which replaces the oldest; making one costs 1/20 of a step
@@ -241,11 +241,11 @@ def arguments() -> argparse.Namespace:
         help="training steps in all; a resume may change it before the rate falls, i.e. before 1 - DECAY_SHARE of them",
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", type=Path, default=HERE.parent.parent / "runs" / "prior", help="checkpoint and log")
+    parser.add_argument("--work", type=Path, default=ROOT / "runs" / "prior", help="checkpoint and log")
     parser.add_argument("--start", type=Path, help="an exported folder whose weights a new run begins with")
     parser.add_argument("--photographs", type=Path, required=True, help="the output of `lab.prior.photographs`")
     parser.add_argument("--rooms", type=Path, required=True, help="the output of `lab.prior.rooms`")
-    parser.add_argument("--out", type=Path, default=HERE, help="the folder to export to")
+    parser.add_argument("--out", type=Path, default=ROOT / "priors" / "tiny", help="the folder to export to")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--export-every", type=int, default=500, help="steps between exports")
     parser.add_argument("--threads", type=int, default=os.cpu_count())

@@ -3,7 +3,7 @@
 Outside the image areas of all training views a fit has no Gaussians, or Gaussians that no photograph supervised. New
 views that look in these directions show black holes and blobs. Gaussians that the training views hardly see are
 therefore removed, and the sphere is added behind everything. Each of its disks has the blurred color of the surfaces
-that lie in about the same direction. (Alternatives that were measured: docs/results.md#backdrop.)
+that lie in about the same direction.
 """
 
 from __future__ import annotations
