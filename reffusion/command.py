@@ -1,4 +1,4 @@
-"""The command `reffusion` (or `python -m reffusion.command`), which starts the runner or a module of report/.
+"""The command `reffusion` (or `python -m reffusion.command`), which starts the runner, or a module of report/ or lab/.
 
 This module imports only the standard library, so that the command starts without delay.
 """

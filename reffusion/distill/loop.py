@@ -3,7 +3,7 @@
     L = L_reconstruction + lambda_SDS L_SDS + lambda_depth L_depth + lambda_adversarial L_adversarial      (Eq. 5)
 
 term             pixels                                          Gaussians
-reconstruction   outside C, I and shadows; all if clean          unmasked (or all that show there); all if clean
+reconstruction   outside C and I (clean: all), no shadow         unmasked (or all that show there); all if clean
 SDS              whole view and patches, the hole repainted      masked (or all)
 depth            the hole                                        masked, all but spherical harmonics
 adversarial      patches around the hole                         masked (or all), spherical harmonics only

@@ -19,7 +19,7 @@ class Sheets:
     Opaque neighboring Gaussians cannot show a sharp picture from all sides. On a slanted surface each Gaussian
     occludes the near side of the next one behind it. So the texture appears shifted away from the camera by a third of
     the Gaussians' spacing, and between opposite views by twice this distance. Fainter Gaussians reduce the shift; the
-    second sheet keeps the surface closed. Figures are in docs/method.md#initialization.
+    second sheet keeps the surface closed. See docs/method.md#initialization.
 
     PAPER leaves open: scale and opacity of the initial Gaussians.
 
