@@ -70,9 +70,10 @@ def load_train_views(
 ) -> list[TrainView]:
     """Load the training views, and after them the camera-only views, which supervise nothing.
 
-    A view holds its photograph, the pixels that may supervise (those outside C and I, in a clean view all, without shadows and ignored pixels), the pixels to repaint (as `params.repaint` says; none in a clean view), and its lifted image. The photo
-    of a camera-only view is black. Pixels that `initialize` found to be in the object's shadow do not supervise. If
-    `initialize` reduced the invent mask of a view, the reduced mask is used.
+    A view holds its photograph, the pixels that may supervise (those outside C and I, in a clean view all, without
+    shadows and ignored pixels), the pixels to repaint (as `params.repaint` says; none in a clean view), and its lifted
+    image. The photo of a camera-only view is black. If `initialize` reduced the invent mask of a view, the reduced mask
+    is used.
 
     Args:
         params: Parameters of the stage `distill`.
