@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 from dataclasses import replace
@@ -261,7 +260,8 @@ def test_make_knows_every_kind_by_its_name(generate, tmp_path):
 
 
 def test_views_that_look_past_differ_from_the_demo_in_direction_alone(generate):
-    photographs = importlib.import_module("photographs")
+    from lab.scenes import photographs
+
     demo, past = generate.KINDS["mini"], replace(generate.KINDS["mini"], past=0.15)
     target = np.array([0.0, 1.0, 0.0])
     assert (photographs.path(0, demo, target, 8, "train") == photographs.path(0, past, target, 8, "train")).all()
