@@ -11,7 +11,6 @@ Settings that are already in the file are not run again, so another --start need
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 import yaml
 
+from lab.studies.scene_priors import run_study
 from reffusion import trace
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
 from reffusion.distill.loop import average, build_objective, masked_factors, take_step
@@ -191,7 +191,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)

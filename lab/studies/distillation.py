@@ -12,7 +12,6 @@ is chosen by it. The study writes distillation.json and distillation.png to --ou
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from lab.studies.holes import Case, to_tensors
 from lab.studies.prior import scene_cases
+from lab.studies.scene_priors import run_study
 from reffusion import seeding
 from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image
@@ -218,7 +218,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from lab.studies.scene_priors import run_study
 from reffusion.io.arrays import load_json, save_json, save_text
 from report import page
 
@@ -54,7 +55,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)

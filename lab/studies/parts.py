@@ -19,7 +19,6 @@ import importlib
 import inspect
 import io
 import shutil
-import sys
 import time
 import tokenize
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from lab.studies.scene_priors import run_study
 from lab.studies.switches import PARTS, TEXTURE, Switch
 from reffusion.io.arrays import load_json, save_json, save_text
 from reffusion.io.images import load_image, load_mask, save_image
@@ -250,7 +250,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)

@@ -20,12 +20,11 @@ import torch
 from torch import Tensor
 
 from lab.studies import scene_priors
-from lab.studies.control import load_truth
+from lab.studies.control import ROOT, load_truth
 from reffusion.distill.inputs import load_adapted_prior, load_train_views
 from reffusion.distill.train_view import TrainView
-from reffusion.io.arrays import load_json, save_text
+from reffusion.io.arrays import save_text
 from reffusion.io.scene import load_references
-from reffusion.params.base import Prompts
 from reffusion.params.distill import Params
 from reffusion.prior import denoising, windows
 from reffusion.prior.crops import GLOBAL, LOCAL, Batch, make_picture
@@ -34,9 +33,9 @@ from reffusion.seeding import generator
 from reffusion.workspace import Workspace
 from report import page
 from report.paired_statistics import confidence_half_width
+from runner.resolve import Request, resolve
 
 DRAWS = 4  # noises, and windows, of each view
-NEUTRAL = Prompts(whole="A photo of a scene", crop="A photo of a scene, cropped")  # as of `no_personalization`
 
 
 @torch.no_grad()
@@ -75,8 +74,8 @@ def measure_scene(scene: Path, other: Path, runs: Path) -> np.ndarray:
         if not needed.is_dir():
             raise ValueError(f"{needed} is missing: run `reffusion run {needed.name}` in the profile paper-terms first")
     space = Workspace(run / "poses", run / "fit", run / "masks")
-    prior_name = load_json(run / "personalize" / "receipt.json")["params"]["prior"]
-    params = Params(prior=prior_name, repaint="consistent").changed({"sds.run": "always"})
+    request = lambda variant: Request(ROOT, runs, str(scene), profile="paper-terms", variant=variant)
+    params, plain = (Params(**resolve(request(each)).params["distill"]) for each in (None, "no_personalization"))
     views = load_train_views(params, space)
     references = {each.camera.name for each in load_references(run / "reference", space.scene)}
     pairs = [
@@ -90,8 +89,8 @@ def measure_scene(scene: Path, other: Path, runs: Path) -> np.ndarray:
         assert prior is not None and text is not None
         return measure_errors(prior, text, pairs)
 
-    before = errors(params.changed({"prompts": NEUTRAL.model_dump()}), None)
-    return np.stack([errors(params, runs / each.name / "personalize") for each in (scene, other)]) / before
+    after = [errors(params, runs / each.name / "personalize") for each in (scene, other)]
+    return np.stack(after) / errors(plain, None)
 
 
 def tabulate(errors: dict[str, np.ndarray]) -> str:
@@ -117,7 +116,10 @@ def main() -> None:
         raise ValueError("the prior of another scene is measured, too: name two scenes or more")
     others = scenes[1:] + scenes[:1]
     table = tabulate(
-        {scene.name: measure_scene(scene, other, arguments.runs) for scene, other in zip(scenes, others, strict=True)}
+        {
+            scene.name: measure_scene(scene, other, arguments.runs.resolve())
+            for scene, other in zip(scenes, others, strict=True)
+        }
     )
     save_text(arguments.out / "personalized.md", table)
     print(table)

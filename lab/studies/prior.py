@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +48,7 @@ from lab.studies.holes import (
     save_row,
     to_tensors,
 )
+from lab.studies.scene_priors import run_study
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
@@ -454,7 +454,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)

@@ -14,7 +14,6 @@ prints a table, and writes unseen.json and rows of pictures (unseen pixels in gr
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +23,7 @@ import numpy as np
 import torch
 
 from lab.studies.prior import keep_if_same, profile_params
+from lab.studies.scene_priors import run_study
 from reffusion import geometry, seeding
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
@@ -267,7 +267,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    run_study(main)
