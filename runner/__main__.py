@@ -128,7 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; default: all")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; default of batch: data/")
-    names = "laptop, laptop-terms, paper, paper-terms, best, fast"
+    names = "laptop, fine, laptop-terms, paper, paper-terms, best, fast"
     parser.add_argument("--profile", help=f"auto, or a profile of pipeline.yaml: {names}")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--variants", default="", help="compare: only these, separated by commas")

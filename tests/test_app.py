@@ -302,6 +302,15 @@ def test_the_state_says_what_was_found_and_what_is_missing(page, scene):
     assert status == 200 and Image.open(io.BytesIO(picture)).format == "JPEG"
 
 
+def test_a_finer_fit_is_chosen_and_its_time_is_in_the_plan(page, scene):
+    wait_until(lambda: not page.state()["plan"]["busy"] and page.state()["plan"]["quality"] == "laptop")
+    normal = page.state()["plan"]["seconds"]
+    assert page.post("/scenes/scene/do/quality", {"profile": "paper"})[0] == 400
+    assert page.post("/scenes/scene/do/quality", {"profile": "fine"})[0] == 200
+    wait_until(lambda: page.state()["plan"]["quality"] == "fine" and not page.state()["plan"]["busy"])
+    assert page.state()["plan"]["seconds"] > normal
+
+
 def test_a_job_is_started_stopped_and_goes_on(page, scene):
     assert page.post("/scenes/scene/do/stop")[0] == 400, "nothing runs"
     assert page.post("/scenes/scene/do/start")[0] == 200

@@ -147,7 +147,7 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
         return REPORT_PLACES if report else TUNING_PLACES
     drawn = drawn_places.load_drawn_places()
     known = {place.name: (place,) for place in (*TUNING_PLACES, *REPORT_PLACES, *NAMED_PLACES, *drawn)}
-    known |= {use: drawn_places.load_drawn_places(use) for use in ("judge", "mend", "sealed")}
+    known |= {use: drawn_places.load_drawn_places(use) for use in ("judge", "mend", "sealed", "spare")}
     wrong = [name for name in names.split(",") if name not in known]
     if wrong:
         raise ValueError(f"no place is called {', '.join(wrong)}; there are {', '.join(known)}")

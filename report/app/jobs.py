@@ -1,7 +1,8 @@
 """The runner as a process of its own: plans, start, stop, and the progress of a job whoever started it.
 
 A job that the page starts goes on when the page or its server ends, and a job that a terminal started is shown. The
-files are runs/.app/<scene>.json (process and target) and runs/.app/<scene>.log (what the runner prints).
+files are runs/.app/<scene>.json (process and target), <scene>.log (what the runner prints) and <scene>.profile (the
+quality that was chosen on the page).
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from reffusion.command import root
-from reffusion.io.arrays import load_json, save_json
+from reffusion.io.arrays import load_json, save_json, save_text
 from report.app.job_progress import BAR, ShownProgress, estimate_remaining, find_bar, find_running_stage
 from report.app.scenes import OpenScene
 from runner.files import MACHINE, lock_holder
 from runner.plan import FINAL
 
 RECORDS = ".app"  # folder in runs/
+QUALITIES = ("laptop", "fine")  # profiles between which the page lets users choose
 TAIL_BYTES, TAIL_LINES = 20_000, 40
 WITHOUT_MASKS = "poses.clicks={}"  # announces masks by clicks, so that stages accept a scene without masks
 
@@ -51,7 +53,6 @@ class Plan:
 
     Attributes:
         stages: stage -> entry of plan.json.
-        profile: name of the profile.
         lacks_masks: True if the scene needs masks before the whole job can run.
         error: why there is no plan; "" if there is one.
         is_lost: True if the scene's folder or video was not there.
@@ -59,7 +60,6 @@ class Plan:
     """
 
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    profile: str = ""
     lacks_masks: bool = False
     error: str = ""
     is_lost: bool = False
@@ -134,6 +134,26 @@ class Jobs:
         path = scene.home / "plan.json"
         return load_json(path)["stages"] if path.is_file() else {}
 
+    def quality(self, scene: OpenScene) -> str:
+        """Return the profile of the last plan if the user may choose between `QUALITIES`, else ""."""
+        path = scene.home / "plan.json"
+        profile = load_json(path)["profile"] if path.is_file() and "--profile" not in self.options else ""
+        return profile if profile in QUALITIES else ""
+
+    def choose_quality(self, scene: OpenScene, profile: str) -> None:
+        """Take a profile of `QUALITIES` for all further plans and jobs of a scene.
+
+        Raises:
+            ValueError: the profile is none of them, or a job of the scene runs.
+        """
+        if profile not in QUALITIES or not self.quality(scene):
+            raise ValueError(f"there is no quality {profile!r} to choose")
+        state = self.state(scene)
+        if state["state"] in ("running", "elsewhere"):
+            raise ValueError(state["words"] or "a job runs; stop it first")
+        save_text(self._profile_file(scene), profile)
+        self.renew_plan(scene)
+
     def _read_finished(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
         """Return the last plan; stages that were done since then are done in it, too."""
         record = scene.home / "plan.json"
@@ -145,7 +165,9 @@ class Jobs:
         return stages
 
     def _words(self, scene: OpenScene) -> tuple[str, ...]:
-        return ("--scene", str(scene.source), "--runs", str(self.runs), *self.options)
+        chosen = self._profile_file(scene)
+        profile = ("--profile", chosen.read_text()) if chosen.is_file() and "--profile" not in self.options else ()
+        return ("--scene", str(scene.source), "--runs", str(self.runs), *profile, *self.options)
 
     # ------------------------------------------------------------------------------------------------ jobs
 
@@ -277,6 +299,9 @@ class Jobs:
 
     def _record(self, scene: OpenScene) -> Path:
         return self.runs / RECORDS / f"{scene.name}.json"
+
+    def _profile_file(self, scene: OpenScene) -> Path:
+        return self.runs / RECORDS / f"{scene.name}.profile"
 
     def _log(self, scene: OpenScene) -> Path:
         return self.runs / RECORDS / f"{scene.name}.log"

@@ -208,6 +208,10 @@ def _start(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
     app.jobs.start(scene, "all")
 
 
+def _choose_quality(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
+    app.jobs.choose_quality(scene, str(content.get("profile")))
+
+
 def _stop(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
     app.jobs.stop(scene)
 
@@ -219,6 +223,7 @@ def _export(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
 ACTIONS: dict[str, Callable[[App, OpenScene, dict[str, Any]], dict[str, Any] | None]] = {
     "mask": _begin_masks,
     "start": _start,
+    "quality": _choose_quality,
     "stop": _stop,
     "export": _export,
 }

@@ -65,6 +65,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
                 for name, entry in plan.stages.items()
             ],
             "seconds": sum(expected.values()),
+            "quality": jobs.quality(scene),
             "due": [name for name, entry in plan.stages.items() if entry["word"] not in FINAL],
         },
         "job": job,

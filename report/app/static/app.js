@@ -338,6 +338,8 @@ function drawStart() {
   $('run').disabled = Boolean(state.lost) || plan.busy || (!resumes && (Boolean(plan.error) || state.lacks_masks || !due));
   $('run').textContent = job.state === 'stopped' || job.state === 'failed' ? 'Go on' : 'Start';
   $('halt').hidden = !running;
+  $('qualities').hidden = !plan.quality || isBusy() || state.lacks_masks || Boolean(state.lost);
+  if (!plan.busy && changed('quality', plan.quality)) $('quality').value = plan.quality;
   $('look').hidden = !state.result || isBusy() || !(isDone || state.lost);
   $('look').href = `#${encodeURIComponent(scene)}/result`;
   $('bar').hidden = !isBusy();
@@ -388,6 +390,7 @@ $('run').addEventListener('click', () => {
   $('run').disabled = true;
   act('start');
 });
+$('quality').addEventListener('change', () => act('quality', 'start-lead', {profile: $('quality').value}));
 $('resume').addEventListener('click', () => act('mask', 'method'));
 $('halt').addEventListener('click', async () => {
   $('halt').disabled = true;
