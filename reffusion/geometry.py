@@ -11,6 +11,12 @@ import numpy as np
 
 from reffusion.types import Camera
 
+# Relative differences of depth that say how two surfaces lie. Between the first two nothing is certain.
+SAME_SURFACE = 0.02  # up to this difference, two renderings show the same surface, or a rendering shows a plane
+OTHER_SURFACE = 0.03  # from this difference on, one surface lies in front of the other
+SAME_IF_MEASURED = 0.01  # as SAME_SURFACE, for depth from plane sweep stereo, which is more exact than rendered depth
+SAME_IF_COARSE = 0.1  # as SAME_SURFACE, for pictures of a few hundred pixels and for single points
+
 
 class Degenerate(ValueError):
     """Error: the data do not determine the result, e.g. because too few pixels have a known depth.

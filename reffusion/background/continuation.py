@@ -18,7 +18,7 @@ from reffusion.background.borders import RIM, extend_borders
 from reffusion.background.corners import find_third_faces, visible_past
 from reffusion.background.plane import CELLS, Plane
 from reffusion.background.plane_fit import MAX_TURN, ransac_plane, refine_by_points, sample_surfaces
-from reffusion.background.visibility import SURFACE, DepthView, count_views, is_seen
+from reffusion.background.visibility import DepthView, count_views, is_seen
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.types import Camera
 
@@ -77,7 +77,7 @@ def find_planes(
             break
         refined = refine_by_points(normal, offset, points, inlier, MIN_SPREAD * radius)
         new_normal, new_offset = refined or (normal, offset)
-        if refined or not _is_duplicate(normal, offset, found, center, SURFACE * distance):
+        if refined or not _is_duplicate(normal, offset, found, center, geometry.SAME_SURFACE * distance):
             found.append((new_normal, new_offset))
         # Sparse points lie around the refined plane, samples around the plane that was fitted to them.
         points = points[np.abs(points @ new_normal - new_offset) >= 1.5 * inlier]
@@ -85,7 +85,7 @@ def find_planes(
     thirds = find_third_faces(samples, unexplained, found, center, radius, inlier)
     is_third = [False] * len(found) + [True] * len(thirds)
     found += thirds
-    band = max(1.5 * inlier, SURFACE * distance)
+    band = max(1.5 * inlier, geometry.SAME_SURFACE * distance)
     maps = [
         _map_plane(*plane, center, REACH * radius, views, third) for plane, third in zip(found, is_third, strict=True)
     ]

@@ -12,7 +12,8 @@ from reffusion.types import Camera
 
 CELLS = 160  # side of a plane's map, in cells
 LARGE = 0.5  # of the seen cells of the largest plane: a plane with fewer may merely cut through a round thing
-IN_FRONT = 0.97  # a plane occludes a surface if its depth is less than this many times the surface's depth
+# A plane occludes a surface if its depth is less than this many times the surface's depth.
+IN_FRONT = 1 - geometry.OTHER_SURFACE
 
 
 @dataclass(frozen=True)

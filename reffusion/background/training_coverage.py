@@ -16,7 +16,6 @@ from reffusion import geometry
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-TOLERANCE = 0.1  # relative depth by which a point may lie behind a training view's surface and still count as seen
 COVERED = 0.8  # alpha below which a pixel counts as unseen, because the fit has no surface there
 SPECKS = 5  # px, side of the median filter that removes single wrong pixels
 LONGEST = 256  # px, larger side at which training views are rendered
@@ -24,9 +23,9 @@ LONGEST = 256  # px, larger side at which training views are rendered
 PROTOCOL = (
     "a pixel is seen where the fit to the photographs covers it (alpha of at least "
     f"{COVERED}) at a point that falls into the frame of a training view, outside its mask, and lies no more than "
-    f"{TOLERANCE:.0%} of its depth behind what the fit shows there; then a median over {SPECKS} x {SPECKS} px. What a "
-    "fit put into free space counts as seen: that is the fit's fault, not the capture's. `unseen_share`: of the pixels "
-    "outside the mask; `psnr_outside_seen`: `psnr_outside` of the seen ones"
+    f"{geometry.SAME_IF_COARSE:.0%} of its depth behind what the fit shows there; then a median over {SPECKS} x "
+    f"{SPECKS} px. What a fit put into free space counts as seen: that is the fit's fault, not the capture's. "
+    "`unseen_share`: of the pixels outside the mask; `psnr_outside_seen`: `psnr_outside` of the seen ones"
 )
 
 
@@ -88,7 +87,7 @@ def unseen_pixels(gaussians: Gaussians, camera: Camera, seen_by: Sequence[Covera
         uv, z = geometry.project(points, view.camera)
         surface, framed = geometry.sample_nearest(view.depth, uv)
         hidden, _ = geometry.sample_nearest(view.hidden, uv)
-        is_seen = framed & ~hidden & (z < (1 + TOLERANCE) * surface)
+        is_seen = framed & ~hidden & (z < (1 + geometry.SAME_IF_COARSE) * surface)
         missed.flat[pixels[is_seen]] = False
         pixels, points = pixels[~is_seen], points[~is_seen]
     return ndimage.median_filter(missed | (alpha < COVERED), SPECKS)

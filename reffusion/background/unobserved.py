@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion import morphology
+from reffusion import geometry, morphology
 from reffusion.background.mirrors import Mirror, render_mirrors
 from reffusion.background.plane import IN_FRONT, Plane
 from reffusion.background.visibility import (
     MASK_MARGIN,
     OPAQUE,
-    SURFACE,
     DepthView,
     count_views,
     depth_range,
@@ -115,7 +114,7 @@ def find_unobserved(
         occluding |= image.plausible_depth < IN_FRONT * np.where((depth > 0) & (alpha > OPAQUE), depth, np.inf)
         plane_depths.append(image.depth)
         # A plane may cut through a round thing. So the mirror image takes precedence if both are about equally near.
-        wins = (occluding | unobserved) & (image.plausible_depth < (1 + SURFACE) * nearest)
+        wins = (occluding | unobserved) & (image.plausible_depth < (1 + geometry.SAME_SURFACE) * nearest)
         nearest = np.where(wins, image.plausible_depth, nearest)
     unobserved = morphology.remove_slivers(unobserved | occluding, MASK_MARGIN) & mask
     below = _below_planes(planes, camera, depth, mask)
@@ -149,7 +148,9 @@ def _continues_surroundings(
         return False
     # A plane that merely cuts through a solid thing does not agree with the depth beside the patch.
     nearest, farthest = depth_range(depth)
-    agrees = (plane_depth > nearest * (1 - SURFACE)) & (plane_depth < farthest * (1 + SURFACE))
+    agrees = (plane_depth > nearest * (1 - geometry.SAME_SURFACE)) & (
+        plane_depth < farthest * (1 + geometry.SAME_SURFACE)
+    )
     agrees &= np.abs(plane_depth - depth) < DEPTH_EDGE * depth
     # The depth of one view may be wrong on rough ground and in reflections. There the other views decide.
     agrees |= plane.pixels_on(plane.seen, plane_depth, camera, ring)

@@ -21,8 +21,6 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 OPAQUE = 0.9  # alpha from which a pixel shows a surface
-SURFACE = 0.02  # relative depth: a point up to this far from a view's depth, on either side, lies on its surface
-FREE = 0.03  # relative depth by which a view must see past a point for the point to be in free space
 ROUGHNESS = 0.006  # of the image's width: half the side of the window of `depth_range`
 # At least this share of the views that could see a surface must show the surface. This condition excludes artifacts
 # that a fit puts below surfaces.
@@ -173,7 +171,7 @@ class Visibility:
 def count_views(points: np.ndarray, views: Sequence[DepthView], normals: np.ndarray | None = None) -> Visibility:
     """Classify points in every view by comparing their depth with the depth that the view shows.
 
-    A point is seen only if it lies on the view's surface, up to a tolerance (`SURFACE`). A point clearly in front of
+    A point is seen only if it lies on the view's surface, up to `geometry.SAME_SURFACE`. A point clearly in front of
     the surface is free, and a point behind the surface is occluded. A point in the mask of the object is only masked.
 
     Args:
@@ -199,7 +197,7 @@ def is_seen(view: DepthView, points: np.ndarray) -> np.ndarray:
 def _count_view(view: DepthView, points: np.ndarray, normals: np.ndarray | None, counts: np.ndarray) -> None:
     """Classify points in one view, and add 1 to the counts [4, P] in place, see `visibility_kernel.count_in_view`."""
     maps = view.depth, view.near_ratio, view.far_ratio, view.masked
-    count_in_view(points, normals, view.camera, maps, (SURFACE, FREE), counts)
+    count_in_view(points, normals, view.camera, maps, (geometry.SAME_SURFACE, geometry.OTHER_SURFACE), counts)
 
 
 def smooth_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import torch
 
+from reffusion import geometry
 from reffusion.types import Camera
 
 NEIGHBORS = 4  # number of views with which each view is matched
@@ -31,7 +32,6 @@ LEAST_CONTRAST = 0.7  # levels of 255: standard deviation in a window of 9 px, b
 NOISE = 0.3
 FARTHEST = 20.0  # units of the normalised frame: points farther away, as in the sky, are moved to this depth
 ZOOM = 1.1  # ratio of focal lengths from which a neighbor's picture is resampled to this view's focal length
-SAME_DEPTH = 0.1  # relative difference of depth, below which a new point lies on the surface of an existing one
 
 
 @dataclass(frozen=True)
@@ -313,7 +313,7 @@ def _is_covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: n
     grid = np.full((high, wide), np.inf)
     np.minimum.at(grid, (row[inside].astype(int), column[inside].astype(int)), local[inside, 2])
     nearest = grid[(pixels[:, 1] // cell).astype(int), (pixels[:, 0] // cell).astype(int)]
-    return nearest < depth * (1 + SAME_DEPTH)
+    return nearest < depth * (1 + geometry.SAME_IF_COARSE)
 
 
 def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

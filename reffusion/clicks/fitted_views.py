@@ -16,7 +16,6 @@ from reffusion.clicks.single_view import ViewEvidence
 from reffusion.types import Camera, Gaussians
 
 MAX_NETWORK_VIEWS = 64  # most views in which the network is asked; in other views the votes of these decide
-SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,6 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
         points, inside = geometry.sample_nearest(views.surface(event.view), event.mark.points)
         uv, z = geometry.project(points[inside], camera)
         here, inside = geometry.sample_nearest(depth, uv)
-        visible = inside & (z > 0) & (np.abs(here - z) < SAME_SURFACE * z)
+        visible = inside & (z > 0) & (np.abs(here - z) < geometry.SAME_SURFACE * z)
         found += [Mark(at[None], event.mark.positive) for at in uv[visible]]
     return found

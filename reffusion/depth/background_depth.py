@@ -24,10 +24,8 @@ from reffusion.types import Camera, Rendering
 MIN_POINTS = 50  # with fewer sparse points around the hole, the rendered depth is used instead
 CONCLUSIVE_SHARE = 0.8  # share of the sparse points explained by planes, above which no further samples are added
 SWEPT_RATIO = 3  # pixels of swept depth for each sparse point that are added to the samples of planes
-OCCLUSION_RATIO = 1.03  # a sparse point this many times as deep as the rendering is occluded
 MAX_EXTRAPOLATION = 1.15  # a continued surface exceeds the range of its known disparities by this factor at most
 MAX_REFUTED_SHARE = 0.05  # share of the hole in which intersecting planes are refuted, above which they are rejected
-IN_FRONT_RATIO = 1.03  # planes are refuted where their disparity exceeds that of a continued plane by this factor
 GAP_RING = 0.01  # of the image's width: width of the ring in which a gap touches surfaces
 MIN_GAP_SHARE = 0.15  # share of this ring that a surface must have
 FARTHEST_RATIO = 2.0  # depth is limited to this many times the farthest known depth
@@ -316,7 +314,9 @@ def _refuted_share(view: ViewDepth, disparity: np.ndarray) -> float:
     # The surface would hide a plane that continues there, or other views see past the surface. For example, the planes
     # of a post and of the ground behind the post intersect in front of ground that other views see, so these planes are
     # rejected.
-    refuted = (view.anchored & (disparity > view.disparity * IN_FRONT_RATIO)) | _in_free_space(view, disparity)
+    refuted = (view.anchored & (disparity > view.disparity * (1 + geometry.OTHER_SURFACE))) | _in_free_space(
+        view, disparity
+    )
     return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
 
 
@@ -385,5 +385,5 @@ def visible_points(
     uv, z = geometry.project(points, camera)
     on_pixels, inside = geometry.sample_nearest(pixels, uv)
     rendered, _ = geometry.sample_nearest(disparity, uv)
-    visible = on_pixels & inside & (z > 0) & (z * rendered < OCCLUSION_RATIO)
+    visible = on_pixels & inside & (z > 0) & (z * rendered < 1 + geometry.OTHER_SURFACE)
     return uv[visible], 1.0 / z[visible]

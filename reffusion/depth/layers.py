@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from reffusion import geometry
 from reffusion.depth.completion import unit_range
 from reffusion.graph_cut import HARD, alpha_expansion
 
@@ -20,7 +21,6 @@ MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are no s
 COLOR_WEIGHT = 0.1  # weight of a pixel's color relative to an edge between neighbors
 MIN_EDGE_COST = 0.05  # minimum cost of separating neighbors, relative to the cost where the picture is uniform
 COLOR_BINS = 12  # bins of a color histogram along each of red, green and blue
-PLANE_TOLERANCE = 0.02  # relative disparity within which a pixel lies on a plane
 MAX_UNEVENNESS = 0.04  # a segment whose median relative disparity from a plane is below this belongs to that plane
 BAND_WIDTH = 0.03  # of the width: the band around a hole in which its surfaces are compared
 CONTACT_PX = 3  # px within which two segments in the band touch
@@ -292,4 +292,4 @@ def _is_in_front(k: int, masks: np.ndarray, dilated: Sequence[np.ndarray], dispa
 
 def _is_on_plane(disparity: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return the pixels, bool [H, W], whose disparity agrees with that of a plane of depth [H, W], inf where absent."""
-    return np.isfinite(depth) & (np.abs(disparity * np.where(np.isfinite(depth), depth, 0) - 1) < PLANE_TOLERANCE)
+    return np.isfinite(depth) & (np.abs(disparity * np.where(np.isfinite(depth), depth, 0) - 1) < geometry.SAME_SURFACE)

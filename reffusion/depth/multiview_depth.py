@@ -29,7 +29,6 @@ MAX_NEIGHBORS, MAX_ANGLE_DEG = (
     3,
     70.0,
 )  # number of other views that a view is compared with, and largest angle between their optical axes and its own
-SAME_SURFACE = 0.01  # relative depth within which the surfaces of two views are the same
 SEEN_PAST = 0.05  # relative depth by which another view must see farther to refute a surface
 GRID_SPACING = 3  # of the grid of confirmed pixels that become samples, in px of a picture `REFERENCE_WIDTH` wide
 
@@ -113,7 +112,7 @@ def _confirmed_pixels(view: Camera, depth: Mapping[str, np.ndarray], views: Sequ
     """Return bool [H, W], the pixels of a view at which another view finds the same surface."""
     result = np.zeros(depth[view.name].shape, bool)
     for other_depth, z, inside, _ in _compare_views(view, depth, depth, views):
-        result |= inside & (np.abs(other_depth - z) < SAME_SURFACE * z)
+        result |= inside & (np.abs(other_depth - z) < geometry.SAME_IF_MEASURED * z)
     return result
 
 

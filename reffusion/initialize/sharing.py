@@ -23,7 +23,6 @@ from reffusion.gaussians.surfels import surface_normals
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
-SAME_DEPTH = 0.015  # relative difference of depth within which two references show the same surface
 SAME_NORMAL = 0.85  # smallest cosine between the normals of the same surface in two references
 PAST = 0.03  # relative difference of depth from which a reference sees past a surface that another one shows
 MIN_COSINE = 0.05  # smallest cosine between normal and view that is counted: the footprint stays finite
@@ -179,7 +178,7 @@ def cross_visibility(
     maps = far, other.pixels, other.footprints, other.normals
     far, covered, footprint, normal = (geometry.sample_nearest(each, uv)[0] for each in maps)
     inside &= (z > 0) & (far > 0)
-    same_depth = (z > (1 - SAME_DEPTH) * near) & (z < (1 + SAME_DEPTH) * far)
+    same_depth = (z > (1 - geometry.SAME_SURFACE) * near) & (z < (1 + geometry.SAME_SURFACE) * far)
     same = inside & covered & same_depth & ((normal * normals).sum(1) > SAME_NORMAL)
     return same, inside & (z < (1 - PAST) * near), footprint
 

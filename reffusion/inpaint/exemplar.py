@@ -24,7 +24,7 @@ from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.depth.layers import segment_foreground, segment_surfaces
 from reffusion.inpaint.normals import mean_normals
 from reffusion.inpaint.patchmatch.completion import Completion, complete
-from reffusion.inpaint.plane_frames import MAX_DISTANCE, label_planes, plane_coordinates, plane_jacobians
+from reffusion.inpaint.plane_frames import label_planes, plane_coordinates, plane_jacobians
 from reffusion.inpaint.poisson import paste
 from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
@@ -97,7 +97,7 @@ def complete_view(
     mirrored = render_mirrors(around.mirrors, camera, hidden, around.views)
     target, sources, smooth, symmetries = _find_surfaces(image, hole, camera, hidden, around, mirrored)
     depth = target.pixel_size * camera.fx
-    in_mirror = hole & mirrored.is_observed & (mirrored.plausible_depth < (1 + MAX_DISTANCE) * depth)
+    in_mirror = hole & mirrored.is_observed & (mirrored.plausible_depth < (1 + geometry.OTHER_SURFACE) * depth)
     if in_mirror.any():
         beside = ~target.masked & _same_depth(depth, mirrored.depth)
         target = _with_filled(target, paste(target.image, mirrored.picture, in_mirror, beside), in_mirror)
@@ -121,8 +121,8 @@ def _complete_rest(
 
 
 def _same_depth(depth: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], True where two depth maps agree within `MAX_DISTANCE`; `other` may be inf (unknown)."""
-    return np.abs(depth - np.where(np.isfinite(other), other, 0.0)) < MAX_DISTANCE * depth
+    """Return bool [H, W], True where two depth maps show no two surfaces; `other` may be inf (unknown)."""
+    return np.abs(depth - np.where(np.isfinite(other), other, 0.0)) < geometry.OTHER_SURFACE * depth
 
 
 def _with_filled(target: SourceImage, image: np.ndarray, filled: np.ndarray) -> SourceImage:
@@ -181,14 +181,14 @@ def _surfaces_behind(
     for k, each in enumerate(planes, start=1):
         at = each.depth(own.camera)
         cells = each.seen | each.enclosed | each.continued | each.reflective
-        possible = hidden | (at < (1 + MAX_DISTANCE) * surface)
+        possible = hidden | (at < (1 + geometry.OTHER_SURFACE) * surface)
         mine = each.pixels_on(cells, at, own.camera, pixels & possible) & (at < nearest)
         plane[mine], nearest[mine] = k, at[mine]
     for k in range(1, len(planes) + 1):
         beside = (plane == k) & ~hidden & (layer >= 0)
         layer[hidden & (plane == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
     # A plane may cut through a round thing; there the mirror image of the thing wins.
-    image = mirrored.plausible_depth < (1 + MAX_DISTANCE) * nearest
+    image = mirrored.plausible_depth < (1 + geometry.OTHER_SURFACE) * nearest
     if image.any():
         thing = known & (layer >= 0) & _same_depth(surface, mirrored.depth)
         layer[image] = np.bincount(layer[thing]).argmax() if thing.any() else 0

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from reffusion import geometry, seeding
 from reffusion.background.plane_fit import ransac_plane
-from reffusion.background.visibility import FREE, OPAQUE, SURFACE, smooth_surface
+from reffusion.background.visibility import OPAQUE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
 from reffusion.inpaint.source_image import without_geometry
 from reffusion.kernels.compiled import side_by_side
@@ -234,9 +234,9 @@ def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View
         uv, z = geometry.project(points, view.camera)
         depth, inside = geometry.sample_nearest(view.depth, uv)
         aligned = np.abs(geometry.sample_nearest(view.normal, uv)[0] @ normal) > MIN_COSINE
-        shows = inside & (z > 0) & (depth > 0) & (np.abs(z - depth) < SURFACE * depth) & aligned
+        shows = inside & (z > 0) & (depth > 0) & (np.abs(z - depth) < geometry.SAME_SURFACE * depth) & aligned
         seen += shows
-        free += inside & (z > 0) & (z < (1 - FREE) * depth)
+        free += inside & (z > 0) & (z < (1 - geometry.OTHER_SURFACE) * depth)
         ray = points - view.camera.center
         quality = np.abs(ray @ normal) / np.linalg.norm(ray, axis=1) ** 3  # cosine over the squared distance
         # best: near, and along the normal

@@ -10,14 +10,12 @@ from reffusion import geometry
 from reffusion.background.plane import Plane
 from reffusion.types import Camera
 
-MAX_DISTANCE = 0.03  # relative difference of depth within which a pixel lies on a plane
-
 
 def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
     """Return int [H, W], the index of the plane on which each pixel lies.
 
-    A pixel lies on a plane if its depth is within `MAX_DISTANCE` (relative) of the plane's depth in this view. The
-    whole infinite plane counts, also where its map says that it does not exist.
+    A pixel lies on a plane if its depth is within `geometry.OTHER_SURFACE` (relative) of the plane's depth in this
+    view. The whole infinite plane counts, also where its map says that it does not exist.
 
     Args:
         depth: [H, W], camera z of the visible surface; 0 where unknown.
@@ -28,7 +26,7 @@ def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> 
         1, 2, ... for the first, second, ... plane; 0 for pixels on none of them. A pixel near several planes gets the
         one closest in depth.
     """
-    label, nearest = np.zeros(depth.shape, np.int64), np.full(depth.shape, MAX_DISTANCE)
+    label, nearest = np.zeros(depth.shape, np.int64), np.full(depth.shape, geometry.OTHER_SURFACE)
     for k, plane in enumerate(planes, start=1):
         off = np.abs(depth / plane.depth(camera) - 1)
         mine = (off < nearest) & (depth > 0)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry, morphology
-from reffusion.background.visibility import FREE, DepthView
+from reffusion.background.visibility import DepthView
 from reffusion.types import Camera
 
 BLUR = 0.008  # of the image's width: standard deviation of the blur with which brightness is compared, against noise
@@ -135,7 +135,7 @@ def project_shadow(
         shape = view.masked.shape
         uv, z = geometry.project(points, view.camera)
         surface, inside = geometry.sample_nearest(view.farthest, uv)
-        visible = inside & (z > 0) & (z < surface * (1 + FREE))
+        visible = inside & (z > 0) & (z < surface * (1 + geometry.OTHER_SURFACE))
         at = uv[visible].astype(np.int64)
         mask, total = np.zeros(shape, bool), np.zeros((*shape, 4), np.float32)
         mask[at[:, 1], at[:, 0]] = True

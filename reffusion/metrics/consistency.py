@@ -12,15 +12,14 @@ from reffusion.depth.completion import complete
 from reffusion.fit.exposure import undo_exposure
 from reffusion.types import Camera
 
-TOLERANCE = 0.02  # relative depth by which a point may lie behind the other view's surface and still count as visible
 SOLID = 0.5  # alpha above which a rendered depth is used
 
 PROTOCOL = (
     "each rendered view and the next by name (the last has none): the mask's pixels, unprojected by rendered depth "
     f"(alpha over {SOLID}), are looked up in the next view bilinearly; compared are those that fall into its frame and "
-    f"lie no more than {TOLERANCE:.0%} behind its rendered depth; mean absolute difference of the 8-bit pictures over "
-    "pixels and channels, in [0, 1], 0 is consistent; `consistency_share`: compared pixels over the mask's; means over "
-    "the pairs. Blur and holes are consistent too: read it beside the other scores"
+    f"lie no more than {geometry.SAME_SURFACE:.0%} behind its rendered depth; mean absolute difference of the 8-bit "
+    "pictures over pixels and channels, in [0, 1], 0 is consistent; `consistency_share`: compared pixels over the "
+    "mask's; means over the pairs. Blur and holes are consistent too: read it beside the other scores"
 )
 
 
@@ -56,8 +55,8 @@ def reprojected_color_difference(first: RenderedView, second: RenderedView) -> t
 
     The pixels are unprojected by the depth of `first` and projected into `second`. Pixels without a depth, and points
     outside the frame of `second`, are not compared. A point that lies farther behind the surface of `second` than the
-    relative depth `TOLERANCE` is occluded in `second` and not compared. A point at which `second` has no depth is
-    compared. The mask of `second` is not used.
+    relative depth `geometry.SAME_SURFACE` is occluded in `second` and not compared. A point at which `second` has no
+    depth is compared. The mask of `second` is not used.
 
     Returns:
         The mean absolute difference over pixels and channels (colors in [0, 1], exposures undone), and the share in
@@ -73,7 +72,7 @@ def reprojected_color_difference(first: RenderedView, second: RenderedView) -> t
     surface, _ = geometry.sample_nearest(second.depth, uv)
     with np.errstate(invalid="ignore"):  # points behind the camera have no pixel
         framed = ((uv >= 0.5) & (uv <= np.array([second.camera.width, second.camera.height]) - 0.5)).all(-1)
-    visible = framed & ((surface == 0) | (z <= (1 + TOLERANCE) * surface))
+    visible = framed & ((surface == 0) | (z <= (1 + geometry.SAME_SURFACE) * surface))
     if not visible.any():
         return None, 0.0
     (column, row), color = uv[visible].T - 0.5, second.unexposed_color

@@ -26,7 +26,6 @@ from reffusion.types import Gaussians, Reference
 
 # Of the image's width: standard deviation of the smoothing, and radius of the window whose range of colors is taken.
 SMOOTH, REACH = 0.02, 0.04
-NEAR = 0.015  # relative difference of depth within which two views show the same surface
 ALIKE = 0.7  # smallest cosine between the normals of the same surface in two views
 LEAST_PIXELS = 40  # pixels, at the size `view_ranking.SIDE`, that both views must show for a pair to be compared
 # Mean difference, colors in [0, 1], from which two pictures contradict each other. On demo-pair true pictures have
@@ -128,7 +127,11 @@ def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) 
     normals_a = surface_normals(hole_a.depth, hole_a.camera)[own]
     normals_b, _ = geometry.sample_nearest(surface_normals(hole_b.depth, hole_b.camera), uv)
     both = (
-        framed & inside & (depth > 0) & (np.abs(z - depth) < NEAR * depth) & ((normals_a * normals_b).sum(-1) > ALIKE)
+        framed
+        & inside
+        & (depth > 0)
+        & (np.abs(z - depth) < geometry.SAME_SURFACE * depth)
+        & ((normals_a * normals_b).sum(-1) > ALIKE)
     )
     if both.sum() < LEAST_PIXELS:
         return None

@@ -20,7 +20,6 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 SIDE = 160  # px, the longer side to which views are reduced before their surfaces are compared
-SAME_SURFACE = 0.1  # relative difference of depth within which two views show the same surface
 GRAY = 128  # gray level of the pixels to be painted
 LEAST_GAIN = 0.02  # share of all pixels to be invented that a view must newly cover to be ranked
 
@@ -137,7 +136,7 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
         # A view covers a pixel of another view if its own hole, at the reduced size, shows the same surface point.
         inside, framed = geometry.sample_nearest(hole.pixels, uv)
         depth, _ = geometry.sample_nearest(hole.depth, uv)
-        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < SAME_SURFACE * depth)
+        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < geometry.SAME_IF_COARSE * depth)
     return covers, len(everything)
 
 
