@@ -13,8 +13,6 @@ from reffusion.background.continuation import find_planes
 from reffusion.background.plane import CELLS, Plane
 from reffusion.background.unobserved import _continues_surroundings, find_unobserved
 from reffusion.background.visibility import (
-    FREE,
-    SURFACE,
     DepthView,
     count_views,
     depth_range,
@@ -288,9 +286,9 @@ def test_visibility_of_points_follows_the_formulas(table_views):
             (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)
             faced = True if sides is None else ((view.camera.center - points) * sides).sum(-1) > 0
             visible = inside & ~hidden & (z > 0) & (nearest > 0)
-            on = (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
-            behind_it = z > farthest * (1 + SURFACE)
-            free = nearest > z * (1 + FREE)
+            on = (z > nearest * (1 - geometry.SAME_SURFACE)) & (z < farthest * (1 + geometry.SAME_SURFACE))
+            behind_it = z > farthest * (1 + geometry.SAME_SURFACE)
+            free = nearest > z * (1 + geometry.OTHER_SURFACE)
             expected += [visible & on & faced, visible & free, visible & behind_it & faced, inside & hidden & (z > 0)]
             assert (is_seen(view, points) == (visible & on)).all()
         for name, count in zip(("seen", "free", "occluded", "masked"), expected, strict=True):

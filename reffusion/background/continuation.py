@@ -17,7 +17,7 @@ from reffusion import geometry, morphology, seeding
 from reffusion.background.borders import RIM, extend_borders
 from reffusion.background.corners import find_third_faces, visible_past
 from reffusion.background.plane import CELLS, Plane
-from reffusion.background.plane_fit import MAX_TURN, ransac_plane, refine_by_points, sample_surfaces
+from reffusion.background.plane_fit import MAX_TURN, refine_by_points, sample_surfaces, search_planes
 from reffusion.background.visibility import DepthView, count_views, is_seen
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.types import Camera
@@ -25,7 +25,8 @@ from reffusion.types import Camera
 REACH = 2.5  # in radii of the object: surfaces up to this distance from the middle of the object are considered
 INLIER = 0.08  # in radii of the object: distance within which a sample belongs to a plane
 MIN_SPREAD = 0.25  # in radii of the object: `min_spread` of `plane_fit.refine_by_points`
-MIN_SHARE = 0.1  # least share of all samples that must lie on a plane
+CLAIMED = 1.5  # inlier distances within which samples and sparse points belong to a plane, and to no later one
+MIN_SHARE, MIN_SAMPLES = 0.1, 50  # least share of all samples, and least number, that must lie on a plane
 MAX_PLANES = 5
 MIN_PATCH = 0.05  # area relative to the largest patch of seen cells, below which a patch does not belong to the plane
 ALIGN_INLIER = (0.05, 0.03, 0.015, 0.015)  # relative depth error below which a pixel is an inlier, in successive fits
@@ -71,21 +72,21 @@ def find_planes(
     distance = float(np.median([np.linalg.norm(view.camera.center - center) for view in views])) if views else 0.0
     found: list[tuple[np.ndarray, float]] = []
     generator = np.random.default_rng(seeding.seed_for(seed, "planes around"))
-    while unexplained.sum() >= max(50, MIN_SHARE * len(samples)) and len(found) < MAX_PLANES:
-        normal, offset, support = ransac_plane(samples[unexplained], inlier, generator)
-        if support < MIN_SHARE * len(samples):
-            break
+    least = max(MIN_SAMPLES, MIN_SHARE * len(samples))
+    for normal, offset in search_planes(samples, inlier, generator, least, CLAIMED):
         refined = refine_by_points(normal, offset, points, inlier, MIN_SPREAD * radius)
         new_normal, new_offset = refined or (normal, offset)
         if refined or not _is_duplicate(normal, offset, found, center, geometry.SAME_SURFACE * distance):
             found.append((new_normal, new_offset))
         # Sparse points lie around the refined plane, samples around the plane that was fitted to them.
-        points = points[np.abs(points @ new_normal - new_offset) >= 1.5 * inlier]
-        unexplained &= np.abs(samples @ normal - offset) >= 1.5 * inlier
+        points = points[np.abs(points @ new_normal - new_offset) >= CLAIMED * inlier]
+        unexplained &= np.abs(samples @ normal - offset) >= CLAIMED * inlier
+        if len(found) == MAX_PLANES:
+            break
     thirds = find_third_faces(samples, unexplained, found, center, radius, inlier)
     is_third = [False] * len(found) + [True] * len(thirds)
     found += thirds
-    band = max(1.5 * inlier, geometry.SAME_SURFACE * distance)
+    band = max(CLAIMED * inlier, geometry.SAME_SURFACE * distance)
     maps = [
         _map_plane(*plane, center, REACH * radius, views, third) for plane, third in zip(found, is_third, strict=True)
     ]

@@ -5,7 +5,7 @@ A plane is given by its unit normal [3] and its offset: it consists of the point
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -46,19 +46,32 @@ def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView
     return points[np.linalg.norm(points - center, axis=1) < radius]
 
 
-def ransac_plane(
-    points: np.ndarray, inlier_distance: float, generator: np.random.Generator
-) -> tuple[np.ndarray, float, int]:
-    """Find the plane with most inliers by RANSAC, and refit it to its inliers by least squares.
+def search_planes(
+    points: np.ndarray, inlier_distance: float, generator: np.random.Generator, least: float, claimed: float = 1.0
+) -> Iterator[tuple[np.ndarray, float]]:
+    """Find planes one after the other by RANSAC, about by decreasing number of points.
 
     Args:
-        points: [P, 3], P at least 1.
-        inlier_distance: distance from the plane below which a point is an inlier.
+        points: [P, 3].
+        inlier_distance: distance from a plane below which a point is an inlier.
+        least: number of inliers below which the search ends.
+        claimed: in inlier distances: later planes do not use points that are nearer to an earlier plane than this.
 
-    Returns:
-        Unit normal [3] of either sign and offset of the refitted plane, and the number of its inliers. The number is 0
-        if all drawn triples of points are collinear; the plane then means nothing.
+    Yields:
+        Unit normal [3] of either sign, and offset.
     """
+    while len(points) >= max(least, 1):
+        normal, offset, inliers = _ransac_plane(points, inlier_distance, generator)
+        if inliers < least:
+            return
+        yield normal, offset
+        points = points[np.abs(points @ normal - offset) >= claimed * inlier_distance]
+
+
+def _ransac_plane(
+    points: np.ndarray, inlier_distance: float, generator: np.random.Generator
+) -> tuple[np.ndarray, float, int]:
+    """Return normal [3] and offset of the plane with most inliers, and their number; 0 if all triples are collinear."""
     first, second, third = (points[generator.integers(len(points), size=TRIALS)] for _ in range(3))
     normals = np.cross(second - first, third - first)
     length = np.linalg.norm(normals, axis=1)

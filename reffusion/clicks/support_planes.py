@@ -8,10 +8,12 @@ label them.
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from reffusion import seeding
-from reffusion.background.plane_fit import ransac_plane
+from reffusion.background.plane_fit import search_planes
 
 # Lengths are shares of the object's radius: the 95 % quantile of the distance of its Gaussians from their median.
 REACH = 2.0  # Gaussians farther from the object's median are not considered
@@ -45,14 +47,8 @@ def find_support_gaussians(means: np.ndarray, is_object: np.ndarray, is_other: n
     points = means[near & is_other]
     points = points[generator.permutation(len(points))[:SAMPLES]]
     least, inlier_distance = max(MIN_GAUSSIANS, MIN_SHARE * len(points)), INLIER_DISTANCE * radius
-    for _ in range(PLANES):
-        if len(points) < least:
-            break
-        normal, offset, count = ransac_plane(points, inlier_distance, generator)
-        if count < least:
-            break
+    for normal, offset in islice(search_planes(points, inlier_distance, generator, least), PLANES):
         on_plane = np.abs(means @ normal - offset) < inlier_distance
         if on_plane[is_object].mean() < MAX_OBJECT_SHARE:
             found |= on_plane & near
-        points = points[np.abs(points @ normal - offset) >= inlier_distance]
     return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from reffusion import geometry, seeding
-from reffusion.background.plane_fit import ransac_plane
+from reffusion.background.plane_fit import search_planes
 from reffusion.background.visibility import OPAQUE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
 from reffusion.inpaint.source_image import without_geometry
@@ -153,15 +154,7 @@ def _sample(views: Sequence[_View], seed: int) -> tuple[np.ndarray, float]:
 def _find_planes(samples: np.ndarray, inlier: float, seed: int) -> list[tuple[np.ndarray, float]]:
     """Find planes by RANSAC, and return the normal [3] and offset of each, about by decreasing number of samples."""
     generator = np.random.default_rng(seeding.seed_for(seed, "planes of the scene"))
-    planes: list[tuple[np.ndarray, float]] = []
-    unexplained = np.ones(len(samples), bool)
-    while unexplained.sum() > MIN_SHARE * len(samples) and len(planes) < MAX_PLANES:
-        normal, offset, support = ransac_plane(samples[unexplained], inlier, generator)
-        if support < MIN_SHARE * len(samples):
-            break
-        planes.append((normal, offset))
-        unexplained &= np.abs(samples @ normal - offset) >= 2 * inlier
-    return planes
+    return list(islice(search_planes(samples, inlier, generator, MIN_SHARE * len(samples), claimed=2), MAX_PLANES))
 
 
 def _map_planes(
