@@ -27,7 +27,7 @@
 ##                                painter=moebius: those of this painter too
 ## make doctor                    let each inpainter on this machine fill one hole: time, memory, runs/doctor.png
 ## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
-##                                -360, -seen, -photos, -behind, -beside, -table, -corner, -grass, -insert, -outpaint,
+##                                -360, -seen, -photos, -behind, -beside, -around, -table, -corner, -grass, -insert, -outpaint,
 ##                                -mono, -pair, -past, -sparse, each also with -N
 ## make scene=X adapted           views painted by the adapted prior and the unadapted one: runs/X/adapted/sheet.png
 ## make scene=X sds-variance      variance of the SDS gradient before and after personalization
@@ -122,7 +122,7 @@ $(VENV)/.lpips: | $(VENV)/.ready
 # --------------------------------------------------------------------------------------------------------- scenes
 
 # Generated scenes: `demo` and `demo-<kind>`, with or without `-<seed>`.
-kinds := photos wide mono 360 beside past seen behind table corner grass insert outpaint pair sparse
+kinds := photos wide mono 360 beside around past seen behind table corner grass insert outpaint pair sparse
 # Their names are parts of recipes, so that they may have these characters only.
 plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)

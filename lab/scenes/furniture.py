@@ -339,3 +339,31 @@ def chest_with_neighbors(f: Furniture, draw, x: float, z: float) -> None:
             f.sphere(at[0], 0.008, at[1], 0.12, Material("globe"), draw.uniform(0, 360))
         else:
             f.cylinder(at[0], 0.008, at[1], 0.09, 0.3, Material("vase"))
+
+
+def box_among_things(f: Furniture, draw, x: float, z: float) -> None:
+    """Add the removable object of the kind "around", a low box, and five or six things that stay.
+
+    The things stand anywhere around the box, and touch it or are 5 cm away from it.
+    """
+    wide, deep, high = draw.uniform(0.7, 1.0), draw.uniform(0.5, 0.7), draw.uniform(0.2, 0.32)
+    f.box(x, 0.008, z, (wide, high, deep), Material("paint", 1.3), top=Material("quilt"), removable=True)
+    count = int(draw.integers(5, 7))
+    for k in range(count):
+        angle, gap = 2 * np.pi * (k + draw.uniform(-0.25, 0.25)) / count, draw.choice((0.002, 0.05))
+        across, along = np.cos(angle), np.sin(angle)
+        at_end = abs(across) * deep > abs(along) * wide  # at a face that looks along x
+        reach = (wide if at_end else deep) / 2
+        shift = reach * (along / abs(across) if at_end else across / abs(along))
+        kind, size = draw.choice(("box", "turned box", "ball", "plate", "vase")), draw.uniform(0.2, 0.3)
+        out = reach + gap + size / 2 * (np.sqrt(2) if kind == "turned box" else 1)
+        px, pz = (np.sign(across) * out, shift) if at_end else (shift, np.sign(along) * out)
+        px, pz = x + px, z + pz
+        if kind in ("box", "turned box"):
+            yaw, material = 45.0 if kind == "turned box" else 0.0, Material(str(draw.choice(("crate", "books2"))))
+            f.box(px, 0.008, pz, (size, draw.uniform(0.15, 0.4), size), material, yaw=yaw)
+        elif kind == "ball":
+            f.sphere(px, 0.008, pz, size / 2, Material("globe"), draw.uniform(0, 360))
+        else:
+            high = draw.uniform(0.03, 0.06) if kind == "plate" else draw.uniform(0.2, 0.35)
+            f.cylinder(px, 0.008, pz, size / 2, high, Material("wicker" if kind == "plate" else "vase"), WOOD)

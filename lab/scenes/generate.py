@@ -6,6 +6,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   wide    demo with cameras +-50 degrees around the object
   360     demo with cameras all around an object that lies on the floor
   beside  360 with a chest on the floor, close to four things that stay and that it partly hides in every view
+  around  beside with a low box and five or six things in random places, which may touch it
   seen    demo with an object in mid-air: other views see everything that it hides, so nothing has to be invented
   mono    wide in small views, with a reference whose depth map is as a monocular network gives it
   behind  wide with a second object in front, which stays and hides a part of what the reference is to fill

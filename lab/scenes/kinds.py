@@ -29,7 +29,8 @@ class Kind:
         hangs: True if the object hangs in mid-air, so that other views show everything that it hides.
         place: where the object is: "room" (against a wall), "behind" (another object, which stays, is in front),
             "table" (on the edge of a table), "corner" (in front of the corner of a wall), "grass" (on a lawn), "floor",
-            "beside" (on the floor, close to things that stay) or "pair" (two objects side by side).
+            "beside" (on the floor, close to four things that stay), "around" (the same, with things in random places
+            that may touch the object) or "pair" (two objects side by side).
         task: what the scene asks for. "remove": remove the object. "insert": insert the object, which only the test
             views and the references show. "outpaint": continue the scene beyond a sphere. "sparse": no object is
             removed or inserted, but few views have pixels.
@@ -79,6 +80,7 @@ KINDS = {
     "wide": Kind(spread=50.0),
     "360": Kind(spread=180.0),
     "beside": Kind(spread=180.0, place="beside", least=0.1),
+    "around": Kind(spread=180.0, place="around", least=0.05),
     "seen": Kind(spread=34.0, hangs=True),
     "behind": Kind(spread=50.0, place="behind"),
     "mono": Kind(width=144, height=108, train=40, test=20, spread=50.0, bend=0.0, depth_error=0.25),

@@ -12,6 +12,7 @@ from lab.scenes.furniture import (
     WOOD,
     Furniture,
     Material,
+    box_among_things,
     cabinet,
     chest,
     chest_with_neighbors,
@@ -31,7 +32,8 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.is_circle:
-        return f, _round_room(f, draw, planks, chest_with_neighbors if kind.place == "beside" else daybed)
+        objects = {"beside": chest_with_neighbors, "around": box_among_things}
+        return f, _round_room(f, draw, planks, objects.get(kind.place, daybed))
     others = {"table": table_room, "corner": wall_corner, "grass": garden}
     if kind.place in others:
         return f, others[kind.place](f, draw, planks)
