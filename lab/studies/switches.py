@@ -18,7 +18,6 @@ from reffusion.background.mirrors import MirrorImage, render_mirrors
 from reffusion.depth.completion import complete
 from reffusion.inpaint import classical
 from reffusion.inpaint.patchmatch.completion import Completion
-from reffusion.inpaint.shift_map.assemble import Assembly
 
 INPAINT, BACKGROUND, INITIALIZE = (f"reffusion.{name}." for name in ("inpaint", "background", "initialize"))
 
@@ -53,11 +52,6 @@ def no_mirrors(mirrors: Any, *view: Any) -> MirrorImage:
     return render_mirrors((), *view)
 
 
-def no_pieces(target: Any, hole: np.ndarray, *_: Any) -> Assembly:
-    """Fill nothing from large pieces; stands for `fill_from_photo`."""
-    return Assembly(target.image, np.zeros_like(hole), 0.0)
-
-
 def keep_shadows(trusted: Any, gaussians: Any, background: Any) -> tuple[Any, Any, dict[str, np.ndarray]]:
     """Find no shadow; stands for `remove_shadows`."""
     return trusted, background, {}
@@ -72,7 +66,6 @@ def paint_by(method: Any) -> Any:
 
 MIRRORS = {INPAINT + "exemplar.render_mirrors": no_mirrors}
 REPEATING = {INPAINT + "exemplar._symmetry_of": lambda *_: None}
-PIECES = {INPAINT + "exemplar.fill_from_photo": no_pieces}
 
 TEXTURE = {  # judged first on the picture of the reference
     "mirror images in pictures": Switch("reference", replaced=MIRRORS),
@@ -81,7 +74,6 @@ TEXTURE = {  # judged first on the picture of the reference
         replaced=REPEATING,
         files=("inpaint/shift_map/plane_motions.py", "inpaint/shift_map/plane_symmetry.py"),
     ),
-    "large pieces": Switch("reference", replaced=PIECES, files=("inpaint/shift_map/photo_offsets.py",)),
     "patches of other photographs": Switch(
         "reference", replaced={INPAINT + "exemplar._choose_others": lambda own, views: []}
     ),
@@ -96,7 +88,7 @@ TEXTURE = {  # judged first on the picture of the reference
         "reference", replaced={INPAINT + "exemplar.mask_to_paint": lambda hidden, unknown: unknown}
     ),
     "three candidates": Switch("reference", {"reference.candidates": 1}),
-    "all but PatchMatch": Switch("reference", replaced=MIRRORS | REPEATING | PIECES),
+    "all but PatchMatch": Switch("reference", replaced=MIRRORS | REPEATING),
     "all but Telea's method": Switch(
         "reference", replaced={INPAINT + "exemplar.complete_view": paint_by(classical.telea)}
     ),

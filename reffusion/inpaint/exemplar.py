@@ -1,8 +1,8 @@
 """Exemplar-based inpainting: fills a hole in a view with texture of the photographs.
 
-Textures follow the surfaces that continue into the hole. The hole is filled in four steps, each of which fills what the
-steps before it left: mirror images of symmetric things beside the object, planes whose texture repeats itself, large
-pieces of the view's own photograph, and small patches of all sources. C is the consistent mask, the object's pixels.
+Textures follow the surfaces that continue into the hole. The hole is filled in three steps, each of which fills what
+the steps before it left: mirror images of symmetric things beside the object, planes whose texture repeats itself, and
+small patches of all sources. C is the consistent mask, the object's pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from reffusion.inpaint.normals import mean_normals
 from reffusion.inpaint.patchmatch.completion import Completion, complete
 from reffusion.inpaint.plane_frames import label_planes, plane_coordinates, plane_jacobians
 from reffusion.inpaint.poisson import paste
-from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
 from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, PlaneSymmetry, find_symmetry
 from reffusion.inpaint.source_image import SourceImage
@@ -91,8 +90,7 @@ def complete_view(
         seeds: seeds of the random searches.
 
     Yields:
-        One completion of the view for each seed, in the order of the seeds. Its misfit counts large pieces and patches,
-        each by their share of the pixels that these two steps fill, and serves to compare the completions.
+        One completion of the view for each seed, in the order of the seeds.
     """
     mirrored = render_mirrors(around.mirrors, camera, hidden, around.views)
     target, sources, smooth, symmetries = _find_surfaces(image, hole, camera, hidden, around, mirrored)
@@ -106,18 +104,7 @@ def complete_view(
         assembly = fill_plane(target, hole, sources, plane, symmetry)
         hole = hole & ~assembly.filled
         target = _with_filled(target, assembly.image, assembly.filled)
-    yield from side_by_side(lambda seed: _complete_rest(target, hole, sources, smooth, seed), seeds)
-
-
-def _complete_rest(
-    target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int], seed: int
-) -> Completion:
-    """Fill the hole from large pieces of the view's photograph, `sources[0]`, and from patches where none suits."""
-    assembly = fill_from_photo(target, hole, sources[0], smooth, seed)
-    rest = hole & ~assembly.filled
-    completion = complete(_with_filled(target, assembly.image, assembly.filled), rest, sources, smooth, seed)
-    share = float(rest.sum() / max(hole.sum(), 1))
-    return replace(completion, misfit=share * completion.misfit + (1 - share) * assembly.cost**2)
+    yield from side_by_side(lambda seed: complete(target, hole, sources, smooth, seed), seeds)
 
 
 def _same_depth(depth: np.ndarray, other: np.ndarray) -> np.ndarray:

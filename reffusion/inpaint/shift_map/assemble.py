@@ -2,8 +2,8 @@
 
 A candidate is a photograph that is laid over the hole after a motion, for example a shift. A graph cut chooses one
 candidate for each pixel, so that adjacent pieces meet where they look alike. Poisson blending then removes the seams.
-The candidates come from `photo_offsets` (shifts of the view's own photograph) or `plane_motions` (photographs of a
-plane, moved by motions that map the plane's texture onto itself).
+The candidates come from `plane_motions`: photographs of a plane, moved by motions that map the plane's texture onto
+itself.
 
 Levels are colors in 0..255. The target is the view with the hole. The ring is a strip of known pixels around the hole,
 in which candidates are compared with the known picture.
@@ -11,7 +11,6 @@ in which candidates are compared with the known picture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -29,6 +28,7 @@ MAX_COMPARED = 800  # pixels, at most, on which single candidates are judged bef
 MASK_MARGIN = 2  # px, distance that a piece keeps from masked pixels of its photograph
 INVALID_COST = 500.0  # cost of a pixel that a candidate does not show
 MAX_DIFFERENCE = 60.0  # levels: larger differences of detail count as this much
+COLOR_WEIGHT = 3e-4  # of the pieces' colors in the Poisson blending, in which their gradients have weight 1
 DETAIL_SIGMA = 0.015  # of the image's width: blur that separates detail from tone, which blending evens out
 
 
@@ -95,38 +95,16 @@ class Candidates(Protocol):
 
 
 @dataclass(frozen=True)
-class Options:
-    """Settings of the choice and the blending of pieces.
-
-    Attributes:
-        ring_weight: weight of the difference between a candidate and the known picture in the ring.
-        color_weight: weight of the pieces' colors in the Poisson blending; their gradients have weight 1.
-        max_cost: pixels with this cost or a higher one are not filled. The cost of a pixel is that of the candidate
-            chosen for it (`Candidates.costs`), without seams.
-        max_median_cost: if the median of these costs over the hole is higher, no candidate suits and nothing is filled.
-    """
-
-    ring_weight: float = 1.0
-    color_weight: float = 1e-3
-    max_cost: float = np.inf
-    max_median_cost: float = np.inf
-
-
-@dataclass(frozen=True)
 class Assembly:
     """A picture whose hole is filled from pieces, as far as they suit.
 
     Attributes:
         image: uint8 [H, W, 3], the target's image, changed at the filled pixels only.
         filled: bool [H, W], the pixels of the hole that pieces fill.
-        cost: in levels, the total cost divided by the number of the hole's pixels. The total cost consists of the
-            differences along seams, the differences from the known picture in the ring, and the candidates' own costs.
-            It is 0 if there were no candidates.
     """
 
     image: np.ndarray
     filled: np.ndarray
-    cost: float
 
 
 def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -179,8 +157,7 @@ def assemble(
     hole: np.ndarray,
     pixels: HolePixels,
     candidates: Candidates,
-    regions: Sequence[np.ndarray],
-    options: Options,
+    region: np.ndarray,
 ) -> Assembly:
     """Fill the hole of the target from the candidates.
 
@@ -189,23 +166,19 @@ def assemble(
         hole: bool [H, W].
         pixels: the pixels of the hole to fill, and pixels of its ring, at least one of each.
         candidates: the photographs from which pieces are taken.
-        regions: masks, bool [H, W] each, that together cover the pixels to fill. Each region is blended by itself, so
-            that no tone spreads from one into another.
-        options: settings.
+        region: bool [H, W], the surface to fill. Colors of pixels beside it do not enter the blending.
     """
     coarse, stride = pixels.subsample()
-    labels, cost = _choose(coarse, candidates, hole.shape, stride, options)
+    labels = _choose(coarse, candidates, hole.shape, stride)
     grid = np.full(hole.shape, -1)
     grid[coarse.rows, coarse.columns] = labels
     nearest = ndimage.distance_transform_edt(grid < 0, return_distances=False, return_indices=True)
     labels = grid[tuple(nearest[:, pixels.rows, pixels.columns])]
-    return Assembly(*_blend(target, hole, pixels, labels, candidates, regions, options.color_weight), cost)
+    return Assembly(*_blend(target, hole, pixels, labels, candidates, region))
 
 
-def _choose(
-    pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int, options: Options
-) -> tuple[np.ndarray, float]:
-    """Return each pixel's candidate by a graph cut (`len(candidates)`: none), and the cost per pixel of the hole."""
+def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int) -> np.ndarray:
+    """Return each pixel's candidate, chosen by a graph cut."""
     grid = pixels.rows, pixels.columns
     costs, looks = [], []
     for k in range(len(candidates)):
@@ -214,16 +187,9 @@ def _choose(
         looks.append(features(*grid, samples.colors, samples.detail, shape, stride))
     cost, look = np.array(costs), np.array(looks)
     known = features(*grid, pixels.colors, pixels.detail, shape, stride)
-    off = options.ring_weight * np.minimum(feature_distance(look, known), 2 * MAX_DIFFERENCE)
+    off = np.minimum(feature_distance(look, known), 2 * MAX_DIFFERENCE)
     cost += np.where(pixels.in_hole | (cost >= INVALID_COST), 0, off)
-    pairs = neighbor_pairs(*grid, shape, stride)
-    labels = expand(cost, look, pairs)
-    first, second = pairs.T
-    seams = sum(feature_distance(look[labels[first], at], look[labels[second], at]).sum() for at in (first, second))
-    paid = cost[labels, np.arange(len(labels))]
-    unsuitable = np.median(paid[pixels.in_hole]) > options.max_median_cost
-    labels = np.where((paid < options.max_cost) & ~unsuitable, labels, len(candidates))
-    return labels, float((paid.sum() + seams) / pixels.in_hole.sum())
+    return expand(cost, look, neighbor_pairs(*grid, shape, stride))
 
 
 def _blend(
@@ -232,8 +198,7 @@ def _blend(
     pixels: HolePixels,
     labels: np.ndarray,
     candidates: Candidates,
-    regions: Sequence[np.ndarray],
-    color_weight: float,
+    region: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the picture with the chosen pieces blended by their gradients, and the pixels that were filled."""
     window = tuple(slice(side.min(), side.max() + 1) for side in (pixels.rows, pixels.columns))
@@ -241,7 +206,7 @@ def _blend(
     inner = hole[window]
     own, covered = target.image[window].astype(np.float32), np.zeros_like(inner)
     gradients, counts = np.zeros((2, *own.shape), np.float32), np.zeros((2, *inner.shape), np.float32)
-    for k in np.unique(labels[labels < len(candidates)]):
+    for k in np.unique(labels):
         samples = candidates.sample(k, pixels)
         piece, valid, mine = np.zeros_like(own), np.zeros_like(inner), np.zeros_like(inner)
         piece[at], valid[at], mine[at] = samples.colors, samples.valid, samples.valid & (labels == k)
@@ -255,12 +220,10 @@ def _blend(
                 counts[axis][before] += both
     steps = gradients / np.maximum(counts, 1)[..., None]
     image, filled = target.image.copy(), np.zeros_like(hole)
-    for region in regions:
-        mine = inner & region[window] & covered
-        if mine.any():
-            beside = ~inner & region[window] & ~target.masked[window]
-            # gradients have weight 1, the pieces' colors `color_weight`
-            colors = blend(own, mine, *steps, own, beside, color_weight)
-            image[window][mine] = colors.clip(0, 255).round().astype(np.uint8)
-            filled[window] |= mine
+    mine = inner & region[window] & covered
+    if mine.any():
+        beside = ~inner & region[window] & ~target.masked[window]
+        colors = blend(own, mine, *steps, own, beside, COLOR_WEIGHT)
+        image[window][mine] = colors.clip(0, 255).round().astype(np.uint8)
+        filled[window] |= mine
     return image, filled

@@ -20,7 +20,6 @@ from reffusion.inpaint.shift_map.assemble import (
     MAX_PIXELS,
     Assembly,
     HolePixels,
-    Options,
     Samples,
     assemble,
     erode_readable,
@@ -44,7 +43,6 @@ MIN_SCALE, MAX_SCALE = 0.35, 3.0  # bounds of the scale, along any direction
 OTHER_PHOTO_COST = 6.0  # levels: cost of a pixel from another photograph, whose light may differ
 # Colors of the pieces have a low weight in the blending, because the surroundings of the hole tell better what the
 # plane reflects there than the pieces do.
-OPTIONS = Options(color_weight=3e-4)
 
 
 def fill_plane(
@@ -60,11 +58,10 @@ def fill_plane(
         symmetry: how the texture of the plane repeats itself.
 
     Returns:
-        The target's picture with these pixels filled, the filled pixels, and the cost. No pixel is filled, at a cost
-        of 0, if no photograph shows enough of the plane, if too little of it is known around the hole, or if no motion
-        suits.
+        The target's picture with these pixels filled, and the filled pixels. No pixel is filled if no photograph shows
+        enough of the plane, if too little of it is known around the hole, or if no motion suits.
     """
-    nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
+    nothing = Assembly(target.image, np.zeros_like(hole))
     on_plane = _without_specks(target.plane == plane)
     pixels = hole_pixels(target, hole, hole & on_plane, on_plane & (target.plane_xy != 0).any(-1))
     photos = [photo for source in sources if (photo := PlanePhoto.of(source, plane)) is not None]
@@ -72,7 +69,7 @@ def fill_plane(
         return nothing
     coarse, _ = pixels.subsample()
     candidates = _select_motions(coarse, PlaneMotions(target, photos, symmetry, []))
-    return assemble(target, hole, pixels, candidates, [on_plane], OPTIONS) if len(candidates) else nothing
+    return assemble(target, hole, pixels, candidates, on_plane) if len(candidates) else nothing
 
 
 @dataclass(frozen=True)
