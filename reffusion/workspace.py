@@ -21,8 +21,8 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_ignored, load_mask_sets, load_object_labels, load_scene
-from reffusion.masks.soft_shadow import SoftShadow
 from reffusion.prior import inpaint
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.types import Gaussians, MaskSet, Scene
 
 SURFACES = "background.npz"  # file in the folder of `masks`: planes, mirrors and the object's shadow

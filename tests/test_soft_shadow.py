@@ -10,7 +10,8 @@ from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
 
 from reffusion.background.model import Background
 from reffusion.background.visibility import DepthView
-from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
+from reffusion.shadows.soft_detection import find_soft_shadow
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 

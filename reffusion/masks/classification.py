@@ -20,8 +20,9 @@ from reffusion.masks import consolidation, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.remnants import Remnant, find_remnants
-from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
 from reffusion.params.masks import Params
+from reffusion.shadows.soft_detection import find_soft_shadow
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.types import Gaussians, MaskSet, Scene
 
 
@@ -173,8 +174,8 @@ def find_shadow(params: Params, background: Background, object_means: Tensor, sc
     with_object = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
     shadow = find_soft_shadow(replace(background, photos=with_object), object_means)
     if shadow:
-        darkest = 1 - np.exp(shadow.log_light.min())
-        print(f"the object's shadow, up to {darkest:.0%} darker, is removed (masks.shadows=false keeps it)", flush=True)
+        line = f"the object's shadow, up to {shadow.strength:.0%} darker, is removed (masks.shadows=false keeps it)"
+        print(line, flush=True)
     return shadow
 
 
