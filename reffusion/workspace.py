@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from reffusion.background.model import Background, surfaces_from_arrays
+from reffusion.background.model import Background, build_background, surfaces_from_arrays
 from reffusion.background.visibility import render_depth_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
@@ -149,21 +149,18 @@ class Workspace:
         """
         arrays = load_arrays(self.masks / SURFACES)
         if "center" not in arrays:
-            return self.background_views.with_planes(self.gaussians, self.labels).with_mirrors(self.remaining)
+            return self.background_views.with_surfaces(self.gaussians.means[self.labels], self.remaining)
         return surfaces_from_arrays(self.background_views, arrays, self.device)
 
     @cached_property
     def background_views(self) -> Background:
-        """The background before `masks` searches it: without planes and mirrors, the object's extent still unknown.
-
-        `center` and `radius` have their defaults (the origin, and infinity).
+        """The background before its surfaces are known (`background.model.build_background`).
 
         For a camera-only view, a rendering of the Gaussians takes the place of the photograph. The pixels of
         this view that no photograph shows are in its mask C, so they count as hidden.
         """
         scene = self.scene
-        names = (*scene.train, *scene.camera_only)
-        hidden = {name: self.hidden(name) for name in names}
+        hidden = {name: self.hidden(name) for name in (*scene.train, *scene.camera_only)}
         photos = self.load_photos(scene.train)
         for name in scene.camera_only:
             everything = np.ones_like(hidden[name])
@@ -171,11 +168,4 @@ class Workspace:
             photos[name] = inpaint.composite_background(
                 self.shadowless_gaussians, scene.cameras[name], nothing, everything
             )
-        return Background(
-            render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
-            photos,
-            {name: each.consistent for name, each in self.mask_sets.items()},
-            points=scene.points,
-            unobserved={name: each.unobserved for name, each in self.mask_sets.items()},
-            camera_only=frozenset(scene.camera_only),
-        )
+        return build_background(scene, self.gaussians, hidden, photos, self.mask_sets)

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.background.model import Background
-from reffusion.background.visibility import render_depth_views
+from reffusion.background.model import Background, build_background
 from reffusion.masks import consolidation, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
@@ -108,21 +107,18 @@ def classify_scene(
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     hidden |= {name: hidden[name] | mask for name, mask in marks.ignored.items()}
 
-    background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
     needs_surfaces = params.shadows or consolidation.needs_unobserved(params, marks.fill)
-    if needs_surfaces:
-        background = background.with_planes(gaussians, labels)
-    if background.planes or params.debris:
-        background = replace(background, photos=load_photos())
-    shadow = find_shadow(params, background, gaussians.means[labels], scene)
+    photos = load_photos() if needs_surfaces or params.debris else {}
+    background = build_background(scene, gaussians, {name: hidden[name] for name in scene.train}, photos)
     debris = torch.zeros_like(labels) if marks.scattered is None else marks.scattered
     if params.debris and (marks.raw or deleted is not None):
-        found = find_debris(gaussians, labels, background.views, hidden, background.photos) & ~debris
+        found = find_debris(gaussians, labels, background.views, hidden, photos) & ~debris
         debris = debris | (found if deleted is None else limit_extras(found, deleted, "behind", warnings))
-    labels = labels | debris
+    object_means, labels = gaussians.means[labels], labels | debris
     remaining = gaussians.map(lambda p: p[~labels])
     if needs_surfaces:
-        background = background.with_mirrors(remaining)
+        background = background.with_surfaces(object_means, remaining)
+    shadow = find_shadow(params, background, object_means, scene)
 
     sets = consolidation.classify_pixels(params, scene, remaining, dict(marks.raw), consistent, background, marks.fill)
     sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
