@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from reffusion.background.model import Background, build_background, surfaces_from_arrays
-from reffusion.background.visibility import render_depth_views
+from reffusion.background.visibility import DepthView, render_depth_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
@@ -108,13 +108,22 @@ class Workspace:
         """
         photos = exposure.load_normalized_views(self.poses, self.fit, list(names))
         if shadow := self.shadow:
-            cameras = [self.scene.cameras[name] for name in photos if name not in self.scene.clean]
-            for view in render_depth_views(
-                self.gaussians, cameras, {each.name: self.hidden(each.name) for each in cameras}
-            ):
-                name = view.camera.name
+            for name in photos.keys() - self.scene.clean:
+                view = self.depth_view(name)
                 photos[name] = shadow.remove_from_photo(photos[name], view.camera, view.depth)
         return photos
+
+    def depth_view(self, name: str) -> DepthView:
+        """Return the depth of a view with the object, rendered when it is first asked for."""
+        if name not in self._depth_views:
+            hidden = {name: self.hidden(name)}
+            [self._depth_views[name]] = render_depth_views(self.gaussians, [self.scene.cameras[name]], hidden)
+        return self._depth_views[name]
+
+    @cached_property
+    def _depth_views(self) -> dict[str, DepthView]:
+        """View name -> what `depth_view` has rendered."""
+        return {}
 
     def hidden(self, name: str) -> np.ndarray:
         """Return bool [H, W], the pixels where a view's photograph shows the object, or what the scene ignores.
@@ -160,12 +169,12 @@ class Workspace:
         this view that no photograph shows are in its mask C, so they count as hidden.
         """
         scene = self.scene
-        hidden = {name: self.hidden(name) for name in (*scene.train, *scene.camera_only)}
         photos = self.load_photos(scene.train)
         for name in scene.camera_only:
-            everything = np.ones_like(hidden[name])
+            everything = np.ones_like(self.hidden(name))
             nothing = np.zeros((1, 1, 3), np.uint8)
             photos[name] = inpaint.composite_background(
                 self.shadowless_gaussians, scene.cameras[name], nothing, everything
             )
-        return build_background(scene, self.gaussians, hidden, photos, self.mask_sets)
+        views = [self.depth_view(name) for name in (*scene.train, *scene.camera_only)]
+        return build_background(scene, views, photos, self.mask_sets)

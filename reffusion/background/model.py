@@ -16,7 +16,7 @@ from reffusion.background.continuation import find_planes
 from reffusion.background.mirrors import Mirror
 from reffusion.background.plane import Plane, remove_reflected_depth
 from reffusion.background.symmetry import find_mirrors
-from reffusion.background.visibility import DepthView, count_views, render_depth_views, with_photographed_depth
+from reffusion.background.visibility import DepthView, count_views, with_photographed_depth
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene
 
 _PLANE_ARRAYS = (
@@ -115,8 +115,7 @@ class Background:
 
 def build_background(
     scene: Scene,
-    gaussians: Gaussians,
-    hidden: Mapping[str, np.ndarray],
+    views: Sequence[DepthView],
     photos: Mapping[str, np.ndarray],
     sets: Mapping[str, MaskSet] = MappingProxyType({}),
 ) -> Background:
@@ -125,14 +124,13 @@ def build_background(
     `center` and `radius` have their defaults (the origin, and infinity).
 
     Args:
-        scene: the cameras and the sparse points.
-        gaussians: the whole scene with the object, as the photographs show it.
-        hidden: view name -> bool [H, W], True at pixels that show the object, for the views to take.
+        scene: its sparse points, and the views without a photograph.
+        views: depth of the training views, rendered with the object. Camera-only views may be among them.
         photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
         sets: view name -> pixel classes; empty before they are known.
     """
     return Background(
-        render_depth_views(gaussians, [scene.cameras[name] for name in hidden], hidden),
+        views,
         photos,
         {name: each.consistent for name, each in sets.items()},
         points=scene.points,
