@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from reffusion.background.model import Background, surfaces_from_arrays
-from reffusion.background.visibility import render_depth_views
+from reffusion.background.model import Background, build_background, surfaces_from_arrays
+from reffusion.background.visibility import DepthView, render_depth_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_ignored, load_mask_sets, load_object_labels, load_scene
-from reffusion.masks.soft_shadow import SoftShadow
 from reffusion.prior import inpaint
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.types import Gaussians, MaskSet, Scene
 
 SURFACES = "background.npz"  # file in the folder of `masks`: planes, mirrors and the object's shadow
@@ -108,13 +108,22 @@ class Workspace:
         """
         photos = exposure.load_normalized_views(self.poses, self.fit, list(names))
         if shadow := self.shadow:
-            cameras = [self.scene.cameras[name] for name in photos if name not in self.scene.clean]
-            for view in render_depth_views(
-                self.gaussians, cameras, {each.name: self.hidden(each.name) for each in cameras}
-            ):
-                name = view.camera.name
+            for name in photos.keys() - self.scene.clean:
+                view = self.depth_view(name)
                 photos[name] = shadow.remove_from_photo(photos[name], view.camera, view.depth)
         return photos
+
+    def depth_view(self, name: str) -> DepthView:
+        """Return the depth of a view with the object, rendered when it is first asked for."""
+        if name not in self._depth_views:
+            hidden = {name: self.hidden(name)}
+            [self._depth_views[name]] = render_depth_views(self.gaussians, [self.scene.cameras[name]], hidden)
+        return self._depth_views[name]
+
+    @cached_property
+    def _depth_views(self) -> dict[str, DepthView]:
+        """View name -> what `depth_view` has rendered."""
+        return {}
 
     def hidden(self, name: str) -> np.ndarray:
         """Return bool [H, W], the pixels where a view's photograph shows the object, or what the scene ignores.
@@ -149,33 +158,23 @@ class Workspace:
         """
         arrays = load_arrays(self.masks / SURFACES)
         if "center" not in arrays:
-            return self.background_views.with_planes(self.gaussians, self.labels).with_mirrors(self.remaining)
+            return self.background_views.with_surfaces(self.gaussians.means[self.labels], self.remaining)
         return surfaces_from_arrays(self.background_views, arrays, self.device)
 
     @cached_property
     def background_views(self) -> Background:
-        """The background before `masks` searches it: without planes and mirrors, the object's extent still unknown.
-
-        `center` and `radius` have their defaults (the origin, and infinity).
+        """The background before its surfaces are known (`background.model.build_background`).
 
         For a camera-only view, a rendering of the Gaussians takes the place of the photograph. The pixels of
         this view that no photograph shows are in its mask C, so they count as hidden.
         """
         scene = self.scene
-        names = (*scene.train, *scene.camera_only)
-        hidden = {name: self.hidden(name) for name in names}
         photos = self.load_photos(scene.train)
         for name in scene.camera_only:
-            everything = np.ones_like(hidden[name])
+            everything = np.ones_like(self.hidden(name))
             nothing = np.zeros((1, 1, 3), np.uint8)
             photos[name] = inpaint.composite_background(
                 self.shadowless_gaussians, scene.cameras[name], nothing, everything
             )
-        return Background(
-            render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
-            photos,
-            {name: each.consistent for name, each in self.mask_sets.items()},
-            points=scene.points,
-            unobserved={name: each.unobserved for name, each in self.mask_sets.items()},
-            camera_only=frozenset(scene.camera_only),
-        )
+        views = [self.depth_view(name) for name in (*scene.train, *scene.camera_only)]
+        return build_background(scene, views, photos, self.mask_sets)

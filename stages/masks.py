@@ -96,7 +96,7 @@ def summarize(
     """
     repainted = (*scene.train, *scene.camera_only)
     invent = {name: each.invent for name, each in found.sets.items()}
-    region, shadow = marks.region, found.shadow
+    region = marks.region
     return {
         "kept": [name for name in objects if params.remove is not None and name not in params.remove],
         "masked_gaussians": int(found.labels.sum()),
@@ -108,7 +108,7 @@ def summarize(
         "invent_views": [name for name in repainted if invent[name].any()],
         "best_reference": voting.best_view(invent, scene.train),
         "remnants": [{"removed": each.would_float, "share": each.share, "view": each.view} for each in found.remnants],
-        "shadow": shadow and float(1 - np.exp(shadow.log_light.min())),
+        "shadow": found.shadow and found.shadow.strength,
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
 

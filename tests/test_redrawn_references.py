@@ -18,10 +18,10 @@ from reffusion.capture.views import load_placed_views
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
-from reffusion.masks import reference_shadows
 from reffusion.params.reference import ReferenceSpec
-from reffusion.references import color, registration
+from reffusion.references import changes, color, registration
 from reffusion.references.files import load_reference_files
+from reffusion.shadows.reference_shadows import detect_shadows
 
 pytestmark = pytest.mark.integration
 
@@ -58,10 +58,10 @@ def test_a_redrawn_picture_of_the_view_is_accepted(variant):
     image = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
     low = lambda picture: cv2.GaussianBlur(picture, (0, 0), 3)
     assert psnr(low(image), low(truth), hole) > 35, "the colours and the place of what fills the hole"
-    assert (reference_shadows.detect_shadows(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
+    assert (detect_shadows(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
     away = cv2.dilate(hole.astype(np.uint8), np.ones((17, 17))) == 0
-    usual = reference_shadows.redrawn_difference(image, photo, away)
-    assert reference_shadows.changed_pixels(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"
+    usual = changes.redrawn_difference(image, photo, away)
+    assert changes.changed_pixels(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"
 
 
 @pytest.mark.parametrize("parallax", [2.0, 5.0])

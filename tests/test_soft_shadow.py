@@ -10,7 +10,8 @@ from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
 
 from reffusion.background.model import Background
 from reffusion.background.visibility import DepthView
-from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
+from reffusion.shadows.soft_detection import find_soft_shadow
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
@@ -47,8 +48,8 @@ def background(color: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Backgro
     """Return the background of twelve views of a floor of the given colors."""
     pairs = [floor_view(number, color) for number in range(12)]
     photos = {view.camera.name: photo for view, photo in pairs}
-    scene = Gaussians(MEANS, *(torch.zeros(500, n) for n in (4, 3)), torch.zeros(500), torch.zeros(500, 1, 3))
-    return Background([view for view, _ in pairs], photos).with_planes(scene, torch.ones(500, dtype=torch.bool))
+    nothing = Gaussians(torch.zeros(0, 3), *(torch.zeros(0, n) for n in (4, 3)), torch.zeros(0), torch.zeros(0, 1, 3))
+    return Background([view for view, _ in pairs], photos).with_surfaces(MEANS, nothing)
 
 
 @pytest.fixture(scope="module")

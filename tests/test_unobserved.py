@@ -19,9 +19,9 @@ from reffusion.background.visibility import (
     is_seen,
 )
 from reffusion.gaussians.surfels import surface_gaussians
-from reffusion.masks import reference_shadows
 from reffusion.masks.debris import count_color_mismatches
 from reffusion.morphology import remove_slivers
+from reffusion.shadows import light, reference_shadows
 from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
@@ -241,13 +241,13 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     assert not reference_shadows.detect_shadows(truth, truth, hidden).any()
     points = geometry.unproject(render_table(other.camera)[0], other.camera)
     same = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.25) & ~other.masked
-    carried, light = reference_shadows.project_shadow(
-        found, reference_shadows.log_light(truth, photo), depth, view.camera, [other]
+    carried, own_light = reference_shadows.project_shadow(
+        found, light.log_light(truth, photo), depth, view.camera, [other]
     )["a1"]
     assert carried[same].mean() > 0.9 and not carried[~render_table(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
     core = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.2) & ~other.masked
-    again = reference_shadows.relight((lit * 0.6).astype(np.uint8), light)
+    again = light.relight((lit * 0.6).astype(np.uint8), own_light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"

@@ -114,7 +114,9 @@ SURFACES = {
     ),
     "remnants": Switch("masks", {"masks.remnants": False}, files=("masks/remnants.py",)),
     "debris": Switch("masks", {"masks.debris": False}, files=("masks/debris.py",)),
-    "soft shadows": Switch("masks", {"masks.shadows": False}, files=("masks/soft_shadow.py",)),
+    "soft shadows": Switch(
+        "masks", {"masks.shadows": False}, files=("shadows/soft_detection.py", "shadows/soft_shadow.py")
+    ),
     "tidy masks": Switch("masks", {"masks.tidy": False}),
     "labels by position": Switch("masks", {"masks.inside_share": 1.0}),
 }
@@ -148,10 +150,8 @@ FILLING = {
     ),
     "hard shadows": Switch(
         "initialize",
-        replaced={
-            INITIALIZE + "filling.remove_shadows": lambda trusted, gaussians, background: (trusted, background, {})
-        },
-        files=("initialize/relighting.py",),
+        replaced={INITIALIZE + "filling.remove_shadows": keep_shadows},
+        files=("shadows/reference_shadows.py",),
     ),
     "extra views": Switch("initialize", {"initialize.extra_views": 0}, files=("initialize/extra_views.py",)),
     "farthest surface in gaps": Switch(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from reffusion.background.mirrors import Mirror
 from reffusion.background.plane import Plane, remove_reflected_depth
 from reffusion.background.symmetry import find_mirrors
 from reffusion.background.visibility import DepthView, count_views, with_photographed_depth
-from reffusion.types import PARAMETERS, Camera, Gaussians
+from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene
 
 _PLANE_ARRAYS = (
     "normal",
@@ -94,30 +95,48 @@ class Background:
         points = geometry.unproject(depth, camera).reshape(-1, 3)
         return count_views(points, self.views).is_empty.reshape(depth.shape)
 
-    def with_planes(self, gaussians: Gaussians, labels: Tensor, seed: int = 0) -> Background:
-        """Return the background with newly found planes around the object, and the center and radius of the object.
+    def with_surfaces(self, object_means: Tensor, remaining: Gaussians, seed: int = 0) -> Background:
+        """Return the background with newly found planes and mirrors, and the center and radius of the object.
+
+        Mirrors are symmetric things around the object, with their mirror planes.
 
         Args:
-            gaussians: the N Gaussians of the whole scene.
-            labels: bool [N], True for the Gaussians of the object. If none is True, the background stays as it is.
+            object_means: [N, 3], the centers of the removed Gaussians. If N is 0, the background stays as it is.
+            remaining: the Gaussians of the scene without the removed ones.
             seed: seed of the random draws.
         """
-        if not labels.any():
+        if not len(object_means):
             return self
-        center, radius = robust_extent(gaussians.means[labels])
+        center, radius = robust_extent(object_means)
         planes = find_planes(center, radius, self.views, self.points, seed)
-        return replace(self, planes=planes, center=center, radius=radius)
+        mirrors = find_mirrors(remaining, center, radius, self.views, planes, self.photos)
+        return replace(self, planes=planes, mirrors=mirrors, center=center, radius=radius)
 
-    def with_mirrors(self, remaining: Gaussians) -> Background:
-        """Return the background with newly found mirrors: symmetric things around the object, and their mirror planes.
 
-        The planes, center and radius must be known (`with_planes`); else no mirror is found.
+def build_background(
+    scene: Scene,
+    views: Sequence[DepthView],
+    photos: Mapping[str, np.ndarray],
+    sets: Mapping[str, MaskSet] = MappingProxyType({}),
+) -> Background:
+    """Return the background before planes, mirrors and the extent of the object are known.
 
-        Args:
-            remaining: the Gaussians of the scene without the removed ones.
-        """
-        mirrors = find_mirrors(remaining, self.center, self.radius, self.views, self.planes, self.photos)
-        return replace(self, mirrors=mirrors)
+    `center` and `radius` have their defaults (the origin, and infinity).
+
+    Args:
+        scene: its sparse points, and the views without a photograph.
+        views: depth of the training views, rendered with the object. Camera-only views may be among them.
+        photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
+        sets: view name -> pixel classes; empty before they are known.
+    """
+    return Background(
+        views,
+        photos,
+        {name: each.consistent for name, each in sets.items()},
+        points=scene.points,
+        unobserved={name: each.unobserved for name, each in sets.items()},
+        camera_only=frozenset(scene.camera_only),
+    )
 
 
 def robust_extent(means: Tensor) -> tuple[np.ndarray, float]:

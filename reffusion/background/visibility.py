@@ -18,7 +18,7 @@ from reffusion import geometry, morphology
 from reffusion.background.visibility_kernel import SEEN, UNIT_RATIO, count_in_view
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Camera, Gaussians, Rendering
 
 OPAQUE = 0.9  # alpha from which a pixel shows a surface
 ROUGHNESS = 0.006  # of the image's width: half the side of the window of `depth_range`
@@ -65,6 +65,15 @@ class DepthView:
         far_ratio = np.rint(UNIT_RATIO * np.minimum(known / np.maximum(farthest, _TINY), 1))
         return cls(camera, depth.astype(np.float32), near_ratio.astype(np.uint16), far_ratio.astype(np.uint16), masked)
 
+    @classmethod
+    def from_depth(cls, camera: Camera, depth: np.ndarray, mask: np.ndarray, margin: float = MASK_MARGIN) -> Self:
+        """Construct a DepthView from a depth map, float32 [H, W], and the object's mask, bool [H, W].
+
+        Args:
+            margin: dilation of the mask, as a fraction of the image's width.
+        """
+        return cls.from_range(camera, depth, depth_range(depth), morphology.dilate(mask, margin))
+
     @property
     def nearest(self) -> np.ndarray:
         """[H, W] float32, the nearest depth around each pixel (`depth_range`); 0 where nothing is visible."""
@@ -89,13 +98,13 @@ def render_depth_views(
             without the object.
         margin: dilation of the masks, as a fraction of the image's width.
     """
-    views = []
-    for camera in cameras:
-        rendering = rasterizer.render(gaussians, camera, sh_degree=0)
-        depth = torch.where(rendering.alpha > OPAQUE, rendering.depth, 0).cpu().numpy().astype(np.float32)
-        masked = morphology.dilate(masks[camera.name], margin)
-        views.append(DepthView.from_range(camera, depth, depth_range(depth), masked))
-    return views
+    depths = ((camera, opaque_depth(rasterizer.render(gaussians, camera, sh_degree=0))) for camera in cameras)
+    return [DepthView.from_depth(camera, depth, masks[camera.name], margin) for camera, depth in depths]
+
+
+def opaque_depth(rendering: Rendering) -> np.ndarray:
+    """Return float32 [H, W], the camera z of the visible surface; 0 where nothing opaque is visible."""
+    return torch.where(rendering.alpha > OPAQUE, rendering.depth, 0).cpu().numpy()
 
 
 def depth_range(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

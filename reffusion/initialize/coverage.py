@@ -17,7 +17,7 @@ from torch import Tensor
 from reffusion import morphology
 from reffusion.background.mirrors import render_mirrors
 from reffusion.background.model import Background
-from reffusion.background.visibility import OPAQUE, DepthView
+from reffusion.background.visibility import OPAQUE, DepthView, opaque_depth
 from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
@@ -138,9 +138,8 @@ def completed_views(
     views, found = {view.camera.name: view for view in background.views}, []
     for each in references:
         rendering = rasterizer.render(gaussians, each.camera, sh_degree=0)
-        depth = torch.where(rendering.alpha > OPAQUE, rendering.depth, 0.0).cpu().numpy()
         view = views[each.camera.name]
-        found.append((replace(view, depth=depth, masked=view.masked & ~each.mask), each.image))
+        found.append((replace(view, depth=opaque_depth(rendering), masked=view.masked & ~each.mask), each.image))
     return found
 
 

@@ -18,11 +18,11 @@ from reffusion.initialize.draft import Draft
 from reffusion.initialize.draft_operations import add_random, refit_draft, restrict_invent_masks
 from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
 from reffusion.initialize.fill import fill_references
-from reffusion.initialize.relighting import remove_shadows
 from reffusion.initialize.warped_views import warp_references
 from reffusion.inpaint import feedforward
 from reffusion.masks import voting
 from reffusion.params.initialize import Params
+from reffusion.shadows.reference_shadows import remove_shadows
 from reffusion.trace import Trace
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace

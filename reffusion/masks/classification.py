@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.background.model import Background
-from reffusion.background.visibility import render_depth_views
+from reffusion.background.model import Background, build_background
+from reffusion.background.visibility import DepthView
 from reffusion.masks import consolidation, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.remnants import Remnant, find_remnants
-from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
 from reffusion.params.masks import Params
+from reffusion.shadows.soft_detection import find_soft_shadow
+from reffusion.shadows.soft_shadow import SoftShadow
 from reffusion.types import Gaussians, MaskSet, Scene
 
 
@@ -100,28 +101,26 @@ def classify_scene(
     labels = deleted
     if labels is None:
         labels = consolidation.label_object(params, gaussians, train, ballots, dict(marks.ignored), marks.region)
-    labels, consistent, remnants = complete_object(params, scene, gaussians, labels, bool(marks.raw))
+    labels, consistent, depths, remnants = complete_object(params, scene, gaussians, labels, bool(marks.raw))
     warnings: list[str] = []
     if deleted is not None:
         labels = deleted | limit_extras(labels & ~deleted, deleted, "inside", warnings)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     hidden |= {name: hidden[name] | mask for name, mask in marks.ignored.items()}
 
-    background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
     needs_surfaces = params.shadows or consolidation.needs_unobserved(params, marks.fill)
-    if needs_surfaces:
-        background = background.with_planes(gaussians, labels)
-    if background.planes or params.debris:
-        background = replace(background, photos=load_photos())
-    shadow = find_shadow(params, background, gaussians.means[labels], scene)
+    photos = load_photos() if needs_surfaces or params.debris else {}
+    views = [DepthView.from_depth(camera, depths[camera.name], hidden[camera.name]) for camera in train]
+    background = build_background(scene, views, photos)
     debris = torch.zeros_like(labels) if marks.scattered is None else marks.scattered
     if params.debris and (marks.raw or deleted is not None):
-        found = find_debris(gaussians, labels, background.views, hidden, background.photos) & ~debris
+        found = find_debris(gaussians, labels, views, hidden, photos) & ~debris
         debris = debris | (found if deleted is None else limit_extras(found, deleted, "behind", warnings))
-    labels = labels | debris
+    object_means, labels = gaussians.means[labels], labels | debris
     remaining = gaussians.map(lambda p: p[~labels])
     if needs_surfaces:
-        background = background.with_mirrors(remaining)
+        background = background.with_surfaces(object_means, remaining)
+    shadow = find_shadow(params, background, object_means, scene)
 
     sets = consolidation.classify_pixels(params, scene, remaining, dict(marks.raw), consistent, background, marks.fill)
     sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
@@ -135,7 +134,7 @@ def classify_scene(
 
 def complete_object(
     params: Params, scene: Scene, gaussians: Gaussians, labels: Tensor, has_masks: bool
-) -> tuple[Tensor, dict[str, np.ndarray], list[Remnant]]:
+) -> tuple[Tensor, dict[str, np.ndarray], dict[str, np.ndarray], list[Remnant]]:
     """Extend the labels of an object by what can only belong to it, and by remnants that would float in the air.
 
     A Gaussian whose center lies inside C in (almost) every view can only belong to the object, whatever its votes.
@@ -145,19 +144,20 @@ def complete_object(
         has_masks: whether the scene brings masks, which alone can leave out parts.
 
     Returns:
-        The labels, bool [N]; the consistent mask C of every view, view name -> bool [H, W]; and all remnants.
+        The labels, bool [N]; of every view the consistent mask C, view name -> bool [H, W], and the depth with the
+        object, view name -> float32 [H, W]; and all remnants.
     """
     train = [scene.cameras[name] for name in scene.train]
-    consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
+    consistent, depths = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
     labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
     if not (params.remnants and has_masks):
-        return labels, consistent, []
+        return labels, consistent, depths, []
     remnants = find_remnants(gaussians, labels, [camera for camera in train if camera.name in dirty])
     for remnant in (each for each in remnants if each.would_float):
         labels = labels | torch.as_tensor(remnant.members, device=labels.device)
-        consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
-    return labels, consistent, remnants
+        consistent, depths = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
+    return labels, consistent, depths, remnants
 
 
 def find_shadow(params: Params, background: Background, object_means: Tensor, scene: Scene) -> SoftShadow | None:
@@ -173,8 +173,8 @@ def find_shadow(params: Params, background: Background, object_means: Tensor, sc
     with_object = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
     shadow = find_soft_shadow(replace(background, photos=with_object), object_means)
     if shadow:
-        darkest = 1 - np.exp(shadow.log_light.min())
-        print(f"the object's shadow, up to {darkest:.0%} darker, is removed (masks.shadows=false keeps it)", flush=True)
+        line = f"the object's shadow, up to {shadow.strength:.0%} darker, is removed (masks.shadows=false keeps it)"
+        print(line, flush=True)
     return shadow
 
 

@@ -20,6 +20,7 @@ from reffusion import morphology, trace
 from reffusion.background import training_coverage
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
+from reffusion.background.visibility import opaque_depth
 from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.masks import regions, voting
 from reffusion.masks.regions import FillRequest, Region
@@ -79,8 +80,8 @@ def _total(votes: Votes) -> Tensor:
 
 def render_consistent_masks(
     params: Params, gaussians: Gaussians, labels: Tensor, cameras: Mapping[str, Camera]
-) -> dict[str, np.ndarray]:
-    """Render the consistent mask C of each view: the pixels where the rendered labels exceed tau'.
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Render the consistent mask C of each view, the pixels where the rendered labels exceed tau', and its depth.
 
     Small islands are then removed, and small holes filled (`clean_mask`).
 
@@ -91,10 +92,15 @@ def render_consistent_masks(
         cameras: view name -> camera.
 
     Returns:
-        View name -> bool [H, W].
+        View name -> bool [H, W], C; and view name -> float32 [H, W], the depth of the whole scene
+        (`visibility.opaque_depth`).
     """
-    shares = {name: voting.render_labels(gaussians, labels, camera) for name, camera in cameras.items()}
-    return {name: clean_mask(params, share > params.tau_rendered) for name, share in shares.items()}
+    masks, depths = {}, {}
+    for name, camera in cameras.items():
+        rendering = voting.render_with_labels(gaussians, labels, camera)
+        masks[name] = clean_mask(params, rendering.features[..., 0].cpu().numpy() > params.tau_rendered)
+        depths[name] = opaque_depth(rendering)
+    return masks, depths
 
 
 def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from reffusion import geometry
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Camera, Gaussians, Rendering
 
 VoteMode = Literal["count", "weight"]
 
@@ -158,8 +158,13 @@ def render_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.nd
     Args:
         labels: bool [N], True for labelled Gaussians.
     """
-    rendering = rasterizer.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
-    return rendering.features[..., 0].cpu().numpy()
+    return render_with_labels(gaussians, labels, camera).features[..., 0].cpu().numpy()
+
+
+@torch.no_grad()
+def render_with_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> Rendering:
+    """Render one view with the labels, bool [N], as its only feature; the colors are those of degree 0."""
+    return rasterizer.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
 
 
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:

@@ -15,11 +15,11 @@ from reffusion.capture.lenses import load_lenses
 from reffusion.fit import exposure
 from reffusion.io.files import BadInput
 from reffusion.io.scene import has_photograph, load_views
-from reffusion.masks import reference_shadows
-from reffusion.references import agreement, color, registration, view_ranking
+from reffusion.references import agreement, changes, color, registration, view_ranking
 from reffusion.references.files import ReferenceFile
 from reffusion.references.registration import Registration
 from reffusion.references.undistort import undistort_reference, undistort_reference_depth
+from reffusion.shadows.reference_shadows import detect_shadows
 from reffusion.types import Camera, MaskSet, Reference
 from reffusion.workspace import Workspace
 
@@ -107,15 +107,15 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     if not found.is_identical:
         image, inside = undistort_reference(file, lens, photo, found.affine)
         image = color.recolor(image, found.gain, found.offset)
-        usual = reference_shadows.redrawn_difference(image, photo, inside & ~hidden)
+        usual = changes.redrawn_difference(image, photo, inside & ~hidden)
     margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
-    hole = hidden | reference_shadows.detect_shadows(image, photo, hidden) & inside
+    hole = hidden | detect_shadows(image, photo, hidden) & inside
     image = color.paste(image, photo, hole, inside, margin, blend)
     if masks.invent.any() and (share := inside[masks.invent].mean()) < LEAST_HOLE_SHARE:
         raise ValueError(
             f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less, or paint all of it"
         )
-    differs = masks.consistent | reference_shadows.changed_pixels(image, photo, masks.invent, usual)
+    differs = masks.consistent | changes.changed_pixels(image, photo, masks.invent, usual)
     image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
     depth = undistort_reference_depth(file, lens, found.affine)
     if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalised frame

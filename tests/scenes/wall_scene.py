@@ -144,5 +144,5 @@ def write_background(poses: Path, fit: Path, masks: Path) -> None:
     For tests that write the masks themselves and do not run this stage.
     """
     space = Workspace(poses, fit, masks)
-    background = space.background_views.with_planes(space.gaussians, space.labels).with_mirrors(space.remaining)
+    background = space.background_views.with_surfaces(space.gaussians.means[space.labels], space.remaining)
     save_arrays(masks / SURFACES, surfaces_to_arrays(background))

@@ -1,4 +1,4 @@
-"""Detection of the object's cast shadows, which the masks do not cover.
+"""The object's cast shadows, which the masks do not cover, found by comparison with references.
 
 A reference is a view completed without the object. Where the object casts a shadow, reference and photograph differ
 beside the object. The shadow is projected into the other views, whose photographs are relit.
@@ -7,70 +7,75 @@ beside the object. The shadow is projected into the other views, whose photograp
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry, morphology
-from reffusion.background.visibility import DepthView
-from reffusion.types import Camera
+from reffusion.background.model import Background
+from reffusion.background.visibility import DepthView, with_photographed_depth
+from reffusion.prior import inpaint
+from reffusion.shadows.light import BLUR, DARK_OFFSET, log_light, relight
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians, Reference
 
-BLUR = 0.008  # of the image's width: standard deviation of the blur with which brightness is compared, against noise
-DARK_OFFSET = 8  # of 255, added to both pictures, because the ratios of dark pixels are unreliable
 MIN_DENSITY = 0.05  # number of projected points per pixel below which the light of a pixel is unknown
 LOG_RATIO = 0.08  # absolute logarithm of the brightness ratio above which a pixel is in a shadow
 NEAR_MASK = 0.02  # of the image's width: distance from the mask that a shadow must reach
 MIN_AREA = 0.02  # of the mask's area: area beside the mask that must differ
 PENUMBRA = 0.012  # of the image's width: dilation of a detected shadow, to include its soft rim
-
-# Repainted pixels are found after a blur with a standard deviation of FINE_BLUR of the image's width. A difference of
-# more than CHANGED levels of 255 means that a pixel was repainted.
-FINE_BLUR, CHANGED = 0.003, 8
 NOISE_FACTOR = 4.0  # a pixel of a redrawn picture is in a shadow if its log-ratio is this many times the usual one
-REDRAWN_QUANTILE = 0.99  # quantile of the differences between picture and photograph in `redrawn_difference`
-ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are removed; notches up to twice as wide are closed
 
 
-def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
-    """Return how much a picture differs from its photograph where both show the same, in levels of 255.
+def remove_shadows(
+    references: Sequence[Reference], gaussians: Gaussians, background: Background
+) -> tuple[list[Reference], Background, dict[str, np.ndarray]]:
+    """Detect the object's cast shadow by comparing references with their photographs, and relight all photographs.
 
-    The difference of a pixel is that of the color channel that differs most, after a slight blur. If an autoencoder
-    redrew the picture, its texture differs from that of the photograph everywhere. The result is a high quantile
-    (`REDRAWN_QUANTILE`) of these differences, so smaller differences do not mean that a pixel was repainted.
-
-    Args:
-        reference, photo: [H, W, 3] uint8.
-        known: bool [H, W], True at pixels without the object. If none is True, the result is 0.
-    """
-    return float(np.quantile(_fine_difference(reference, photo)[known], REDRAWN_QUANTILE)) if known.any() else 0.0
-
-
-def changed_pixels(reference: np.ndarray, photo: np.ndarray, within: np.ndarray, noise: float = 0.0) -> np.ndarray:
-    """Return bool [H, W], the pixels where a completed view shows something else than its photograph.
-
-    Small islands are removed, and holes and notches are filled.
+    Of a reference that also fills pixels outside C (the object's mask), only the differences inside C count as shadow:
+    it shows an inserted object, which differs from the photograph, too.
 
     Args:
-        reference: [H, W, 3] uint8, the completed view.
-        photo: [H, W, 3] uint8, its photograph.
-        within: bool [H, W], the pixels to compare. All others are False in the result, unless changed pixels enclose
-            them: such a hole is filled.
-        noise: the result of `redrawn_difference`. Differences up to this many levels of 255 do not count, nor do
-            differences up to `CHANGED` levels.
+        references: completed views, without the object and its shadow.
+        gaussians: of the filled scene.
+        background: the photographs and where they show the object.
+
+    Returns:
+        A tuple of three results:
+
+        - the references, each with the shadow that was detected in its own view added to its mask;
+        - the background. Its photographs have the references' light where they showed the shadow. Pixels whose light
+          is unknown are added to the masks of its views, and so do not supervise;
+        - view name -> bool [H, W], the shadow in each view; an empty dictionary if no reference shows a shadow.
     """
-    differs = within & (_fine_difference(reference, photo) > max(CHANGED, noise))
-    # Some of the repainted pixels may look like the photograph, so holes and notches are closed.
-    kept = morphology.remove_small_parts(differs, ISLAND * within.shape[1], 0)
-    closed = ~morphology.dilate(~morphology.dilate(kept, NOTCH), NOTCH)
-    return ndimage.binary_fill_holes(closed & within)
-
-
-def _fine_difference(reference: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """Return [H, W] in levels of 255, the difference of two blurred pictures in the channel that differs most."""
-    sigma = morphology.to_pixels(FINE_BLUR, photo.shape[1])
-    blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma)
-    return np.abs(blur(reference) - blur(photo)).max(-1)
+    found = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in background.cameras}
+    unknown, photos = dict(found), dict(background.photos)
+    extended = []
+    for each in references:
+        name = each.camera.name
+        mask = background.masks[name]
+        view = inpaint.composite_background(gaussians, each.camera, photos[name], mask)
+        shadow = detect_shadows(each.image, view, mask)
+        if (each.mask & ~mask).any():  # an inserted object and its rim differ too, but are no shadow
+            shadow &= mask
+        extended.append(replace(each, mask=each.mask | shadow))
+        if not shadow.any():
+            continue
+        print(f"reference {name}: beside the hole {shadow.sum()} px differ from what is seen, a shadow perhaps")
+        depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
+        depth = with_photographed_depth(depth, each.camera, background.views)
+        light = log_light(each.image, view)
+        projected = project_shadow(shadow, light, depth, each.camera, background.views)
+        for other, (pixels, own_light) in projected.items():
+            photos[other] = relight(photos[other], own_light)
+            found[other] = found[other] | pixels
+            unknown[other] = unknown[other] | (pixels & np.isnan(own_light).any(-1))
+    if not any(pixels.any() for pixels in found.values()):
+        return list(references), background, {}
+    views = [replace(view, masked=view.masked | unknown[view.camera.name]) for view in background.views]
+    return extended, replace(background, views=views, photos=photos), found
 
 
 def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -99,16 +104,6 @@ def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) ->
     touching = np.unique(parts[mask])
     found = differs & np.isin(parts, touching[touching > 0])
     return morphology.dilate(found, PENUMBRA) if found.any() else found
-
-
-def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Return float32 [H, W, 3], the natural logarithm of the completed view's brightness divided by the photograph's.
-
-    Each color channel has its own ratio. The pictures are blurred first. The arguments are those of `detect_shadows`.
-    """
-    sigma = morphology.to_pixels(BLUR, view.shape[1])
-    blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) + DARK_OFFSET
-    return np.log(blur(reference) / blur(view))
 
 
 def project_shadow(
@@ -146,14 +141,3 @@ def project_shadow(
         own = np.where(known, total[..., :3] / np.where(known, total[..., 3:], 1), np.nan)
         found[view.camera.name] = mask, own
     return found
-
-
-def relight(photo: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Return the photograph, uint8 [H, W, 3], with the shadow's brightness changed to that of the completed view.
-
-    Args:
-        light: [H, W, 3], log light as from `project_shadow`. Where it is NaN, the photograph stays the same.
-    """
-    known = np.isfinite(light)
-    lit = (photo.astype(np.float32) + DARK_OFFSET) * np.exp(np.where(known, light, 0)) - DARK_OFFSET
-    return np.where(known, np.round(lit).clip(0, 255), photo).astype(np.uint8)
