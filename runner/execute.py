@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, artifacts, files, say
-from runner.durations import expected_seconds, total_time, typical_seconds
+from runner.durations import seconds_left, total_time, typical_seconds
 from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
@@ -88,12 +88,11 @@ def _run_stage(
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 
 
-def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
-    """Return text on the expected time of the first of these stages and of all of them; "" if it is unknown."""
-    seconds = expected_seconds(job, next(iter(decisions)))
-    if seconds is None:
+def _time_left(stage: str, seconds: dict[str, float | None]) -> str:
+    """Return text on the expected time of a stage and of all in `seconds`; "" if that of the stage is unknown."""
+    if (own := seconds.get(stage)) is None:
         return ""
-    return f"; about {format_seconds(seconds)}" + (f", {total_time(job, decisions)} to the end" * (len(decisions) > 1))
+    return f"; about {format_seconds(own)}" + (f", {total_time(seconds)} to the end" if len(seconds) > 1 else "")
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
@@ -209,8 +208,8 @@ def run_scene(
                 for warning in read_json(done[stage].path / "warnings.json") or ():  # a stage that runs prints its own
                     say(f"warning: {warning}")
             elif done[stage].status == "run":
-                time_left = _time_left(job, {later: planned[later] for later in stages[position:]})
-                done[stage] = _run_stage(job, stage, time_left, done, lock, execution)
+                seconds = seconds_left(job, {later: planned[later] for later in stages[position:]})
+                done[stage] = _run_stage(job, stage, _time_left(stage, seconds), done, lock, execution)
                 planned = _plan_again(job, planned, done)
             execution.on_change(stage, "done")
         job.hashes.save()

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from runner.durations import expected_seconds, is_timed, total_time
+from runner.durations import seconds_left, total_time
 from runner.keys import files_outside, paths_outside
 from runner.pipeline import SCENE
 from runner.plan import Decision
@@ -20,12 +20,13 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     scene's folder from which files are read.
     """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
+    expected = seconds_left(job, decisions)
     for stage, decision in decisions.items():
-        seconds = expected_seconds(job, stage) if is_timed(job, decision) else None
+        seconds = expected.get(stage)
         time = f"~{format_seconds(seconds)}" if seconds is not None else ""
         lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
-    if total := total_time(job, decisions):
+    if total := total_time(expected):
         lines.append(f"  together about {total}" + (f"; GPU: {job.gpu}" if job.gpu else ""))
     rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
     lines += [f"  besides, {line}" for line in rest]
