@@ -1,7 +1,7 @@
 """Reading of YAML that people write, mainly scene.yaml.
 
-Names of views stay text even if they look like numbers or dates. Size and depth are limited, and aliases are refused,
-since few lines with them can mean billions of values.
+Names of views stay text even if they look like numbers or dates. Size and depth are limited. Tags are refused, and so
+are aliases, since few lines with them can mean billions of values.
 """
 
 import json
@@ -15,15 +15,15 @@ from runner import Refused
 
 MAX_BYTES = 1_000_000  # largest size of a file
 MAX_DEPTH = 20  # largest number of nested lists and mappings
-TAGS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))
+NULL = "tag:yaml.org,2002:null"
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A YAML loader that reads dates as text, because no value in these files is a date."""
+    """A YAML loader for which scalars are numbers, booleans, null or text: dates and `<<` are text."""
 
 
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in those if not tag.endswith(":timestamp")]
+    first: [(tag, pattern) for tag, pattern in those if tag.endswith((":int", ":float", ":bool", ":null"))]
     for first, those in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 
@@ -60,12 +60,10 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
         if node is None or _is_null(node):
             return {}
         if not isinstance(node, yaml.MappingNode):
-            raise Refused(f"{path}: expected `key: value` lines, found a {node.id}")
+            raise ValueError(f"expected `key: value` lines, found a {node.id}")
         return {key: _value(value, key not in typed) for key, value in _pairs(node).items()}
-    except (yaml.YAMLError, ValueError) as error:
-        if line := _line_with_tab(text, error):
-            raise Refused(f"{path}: line {line}: a tab; YAML indents by blanks only") from None
-        raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    except ValueError as error:
+        raise Refused(f"{path}: {error}") from None
 
 
 def parse_value(text: str, is_text: bool) -> Any:
@@ -78,33 +76,29 @@ def parse_value(text: str, is_text: bool) -> Any:
     Raises:
         ValueError: the text is not valid YAML, or a limit of this module is exceeded.
     """
-    try:
-        node = _parse(text)
-    except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from None
+    node = _parse(text)
     return None if node is None else _value(node, is_text)
 
 
-def _line_with_tab(text: str, error: Exception) -> int | None:
-    """Return the number of the line at which YAML failed if this line has a tab, else None."""
-    mark, lines = getattr(error, "problem_mark", None), text.splitlines()
-    return mark.line + 1 if mark and mark.line < len(lines) and "\t" in lines[mark.line] else None
-
-
 def _parse(text: str) -> Any:
-    """Parse YAML within the module's limits to its root node, if any; raises ValueError or yaml.YAMLError."""
+    """Parse YAML to its root node, or None for an empty text; raises ValueError, also beyond the module's limits."""
     depth = 0
-    for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
-        line = f"line {event.start_mark.line + 1}"
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise ValueError(f"{line}: more than {MAX_DEPTH} levels deep")
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"{line}: the alias *{event.anchor:.60} is not understood; write the value itself")
-        tag = getattr(event, "tag", None)
-        if tag not in (None, "!", *TAGS):
-            raise ValueError(f"{line}: the tag {tag!r:.60} is not understood; leave it out")
-    return yaml.compose(text, _Loader)
+    try:
+        for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
+            line = f"line {event.start_mark.line + 1}"
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ValueError(f"{line}: more than {MAX_DEPTH} levels deep")
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{line}: the alias *{event.anchor:.60} is not understood; write the value itself")
+            if (tag := getattr(event, "tag", None)) not in (None, "!"):
+                raise ValueError(f"{line}: the tag {tag!r:.60} is not understood; leave it out")
+        return yaml.compose(text, _Loader)
+    except yaml.YAMLError as error:
+        mark, lines = getattr(error, "problem_mark", None), text.splitlines()
+        if mark and mark.line < len(lines) and "\t" in lines[mark.line]:
+            raise ValueError(f"line {mark.line + 1}: a tab; YAML indents by blanks only") from None
+        raise ValueError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
 
 def _pairs(node: yaml.MappingNode) -> dict[str, yaml.Node]:
@@ -121,7 +115,7 @@ def _pairs(node: yaml.MappingNode) -> dict[str, yaml.Node]:
 
 
 def _is_null(node: yaml.Node) -> bool:
-    return isinstance(node, yaml.ScalarNode) and node.tag == "tag:yaml.org,2002:null"
+    return isinstance(node, yaml.ScalarNode) and node.tag == NULL
 
 
 def _value(node: yaml.Node, is_text: bool) -> Any:
