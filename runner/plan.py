@@ -172,7 +172,7 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].all_needs:
         hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
-        for path in keys.paths_outside(own.params, job.folder):
+        for path in job.paths_outside(stage):
             if job.folder.is_relative_to(path):
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)

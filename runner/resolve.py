@@ -119,6 +119,14 @@ class ResolvedJob(Request):
         """Stage -> all its parameters, defaults included; groups are nested dicts."""
         return {stage: each.params for stage, each in self.stages.items()}
 
+    def paths_outside(self, stage: str) -> list[Path]:
+        """Return the paths outside the scene's folder that a stage reads; scene.yaml or capture files name them."""
+        info = self.stages[stage]
+        if info.reads is not None:
+            return files_outside(info.reads, self.folder)
+        takes_scene = SCENE in self.pipeline.stages[stage].all_needs
+        return list(paths_outside(info.params, self.folder)) if takes_scene else []
+
     def question(self, stage: str) -> dict[str, Any]:
         """Build the question to a stage about the weights that it needs, see `worker.describe`.
 
