@@ -24,9 +24,10 @@ Modules:
   - artifacts.py: compares artifacts with their receipts, and replaces them so that a killed runner loses nothing.
   - files.py: atomic writes, locks, exported copies.
 - worker.py: the process that imports stages. process.py: starts this process, sends it questions, runs stages in it.
-- results.py: prints scores, and calls report/ for tables and pages.
+- results.py: prints scores, and records plans for report/.
 - text.py: errors, sizes, times and paths as text.
 - fleet/: commands on many scenes, variants or machines, and those beside a run. Only __main__.py imports it.
+  - commands.py: their command lines.
   - compare.py: the commands `compare` and `batch`. parallel.py: several runs at once. progress.py: shows each.
   - engine.py: shares this machine among stages; on a cluster: ray_engine.py, slurm_engine.py, retry.py.
   - maintenance.py: verifies or removes artifacts. garbage.py: removes artifacts that no plan uses.

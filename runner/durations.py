@@ -99,20 +99,17 @@ def _slowness(job: ResolvedJob) -> float:
     return seconds / typical
 
 
-def is_timed(job: ResolvedJob, decision: Decision) -> bool:
-    """Return whether a stage counts in the expected time of the job.
+def seconds_left(job: ResolvedJob, decisions: Mapping[str, Decision]) -> dict[str, float | None]:
+    """Return the expected seconds of the stages of a plan that are still to run; None where they are unknown.
 
-    It does if it is to run here or, if the job names another machine's GPU, if it would run there.
+    If the job names another machine's GPU, these are the stages that would run there.
     """
-    return decision.status in TO_DO or (bool(job.gpu) and decision.status not in FINAL)
+    due = lambda status: status in TO_DO or (bool(job.gpu) and status not in FINAL)
+    return {stage: expected_seconds(job, stage) for stage, each in decisions.items() if due(each.status)}
 
 
-def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
-    """Return the expected time of the stages of a plan that are still to run, as text; "" if no stage has one.
-
-    Stages without a known time are named.
-    """
-    seconds = {stage: expected_seconds(job, stage) for stage, each in decisions.items() if is_timed(job, each)}
+def total_time(seconds: Mapping[str, float | None]) -> str:
+    """Return the sum of seconds (stage -> seconds or None) as text, which names the stages without; "" if all are."""
     unknown = ", ".join(stage for stage, known in seconds.items() if known is None)
     total = sum(filter(None, seconds.values()))
     return (format_seconds(total) + (f" and the time of {unknown}" if unknown else "")) if total else ""

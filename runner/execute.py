@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, artifacts, files, say
-from runner.durations import expected_seconds, total_time, typical_seconds
+from runner.durations import seconds_left, total_time, typical_seconds
 from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
@@ -88,12 +88,11 @@ def _run_stage(
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 
 
-def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
-    """Return text on the expected time of the first of these stages and of all of them; "" if it is unknown."""
-    seconds = expected_seconds(job, next(iter(decisions)))
-    if seconds is None:
+def _time_left(stage: str, seconds: dict[str, float | None]) -> str:
+    """Return text on the expected time of a stage and of all in `seconds`; "" if that of the stage is unknown."""
+    if (own := seconds.get(stage)) is None:
         return ""
-    return f"; about {format_seconds(seconds)}" + (f", {total_time(job, decisions)} to the end" * (len(decisions) > 1))
+    return f"; about {format_seconds(own)}" + (f", {total_time(seconds)} to the end" if len(seconds) > 1 else "")
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
@@ -194,9 +193,7 @@ def run_scene(
         lock = locks.enter_context(files.hold_lock(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
         artifacts.recover_swap(job.home, job.hashes)
-        planned = plan(job, stages)
-        say(plan_table(job, planned))
-        _refuse_missing(job, planned)
+        planned = _plan_rest(job, stages, {})
         write_text(job.home / "profile", job.profile + "\n")
         inside = job.folder.is_relative_to(job.root)  # the path of such a scene is recorded relative to the root
         write_text(job.home / "source", f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
@@ -209,27 +206,22 @@ def run_scene(
                 for warning in read_json(done[stage].path / "warnings.json") or ():  # a stage that runs prints its own
                     say(f"warning: {warning}")
             elif done[stage].status == "run":
-                time_left = _time_left(job, {later: planned[later] for later in stages[position:]})
-                done[stage] = _run_stage(job, stage, time_left, done, lock, execution)
-                planned = _plan_again(job, planned, done)
+                seconds = seconds_left(job, {later: planned[later] for later in stages[position:]})
+                done[stage] = _run_stage(job, stage, _time_left(stage, seconds), done, lock, execution)
+                if any(planned[later].status == "pending" for later in stages[position + 1 :]):
+                    planned = _plan_rest(job, stages, done)
             execution.on_change(stage, "done")
         job.hashes.save()
     return {stage: decision.path for stage, decision in done.items()}
 
 
-def _plan_again(job: ResolvedJob, planned: dict[str, Decision], done: dict[str, Decision]) -> dict[str, Decision]:
-    """Return the plan after some stages are done, and print it once none of the others is pending any more."""
-    rest = [stage for stage in planned if stage not in done]
-    if any(planned[stage].status == "pending" for stage in rest):
-        planned = plan(job, list(planned), done)
-        if not any(planned[stage].status == "pending" for stage in rest):
-            say(plan_table(job, {stage: planned[stage] for stage in rest}))
-        _refuse_missing(job, planned)
-    return planned
-
-
-def _refuse_missing(job: ResolvedJob, planned: dict[str, Decision]) -> None:
-    """Raise Refused if a stage of the plan has the status `missing`."""
-    for stage, decision in planned.items():
+def _plan_rest(job: ResolvedJob, stages: list[str], done: dict[str, Decision]) -> dict[str, Decision]:
+    """Plan the stages that are not done, and print this plan at the start and at the end, when none is pending."""
+    planned = plan(job, stages, done)
+    rest = {stage: decision for stage, decision in planned.items() if stage not in done}
+    if not done or not any(decision.status == "pending" for decision in rest.values()):
+        say(plan_table(job, rest))
+    for stage, decision in rest.items():
         if decision.status == "missing":
             raise Refused(f"{job.home.name}: {stage}: {decision.reason}")
+    return rest

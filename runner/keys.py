@@ -112,16 +112,15 @@ class Hashes:
         """
         return hash_listing(self.listing(folder), exclude)
 
-    def listing(self, folder: Path) -> dict[str, str]:
-        """Return name -> hash of all files below a folder, without hidden ones. Names are relative to the folder."""
+    def listing(self, folder: Path, files: Iterable[Path] | None = None) -> dict[str, str]:
+        """Return name relative to `folder` -> hash of `files`; None for all files below it without hidden ones."""
         top = os.path.join(folder, "")
-        return {str(path)[len(top) :]: self.file(path) for path in list_files(folder)}
+        name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
+        return {name(str(path)): self.file(path) for path in (list_files(folder) if files is None else files)}
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
         """Return one hash of the contents of `files` and of their names relative to `folder`, in the given order."""
-        top = os.path.join(folder, "")
-        name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
-        return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
+        return hash_listing(self.listing(folder, files), exclude=())
 
     def weights(self, folder: Path) -> str:
         """Return the hash of a file of weights, or of the folder of a model.

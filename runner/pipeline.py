@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, NonNegativeFloat, PositiveFloat, ValidationError, model_validator
 
 from reffusion.command import scene_name, scene_path, workplace
 from runner import Refused
@@ -134,8 +134,8 @@ class Stage(Strict):
 class Memory(Strict):
     """The expected CPU memory of a stage: `mb` MB, and `each` MB more per MB of files in the folders of its needs."""
 
-    mb: Annotated[float, Field(gt=0)]
-    each: Annotated[float, Field(ge=0)] = 0
+    mb: PositiveFloat
+    each: NonNegativeFloat = 0
 
 
 class Rates(Strict):
@@ -149,14 +149,14 @@ class Rates(Strict):
         steps: the parameter of the stage that counts its steps; "" if it has none.
     """
 
-    base: Annotated[float, Field(ge=0)]
-    view: Annotated[float, Field(ge=0)] = 0
-    test: Annotated[float, Field(ge=0)] = 0
-    placed: Annotated[float, Field(ge=0)] = 0
-    step: Annotated[float, Field(ge=0)] = 0
+    base: NonNegativeFloat
+    view: NonNegativeFloat = 0
+    test: NonNegativeFloat = 0
+    placed: NonNegativeFloat = 0
+    step: NonNegativeFloat = 0
     steps: str = ""
     device: str = "cpu"
-    megapixels: Annotated[float, Field(ge=0)] = 0
+    megapixels: NonNegativeFloat = 0
 
 
 class Pipeline(Strict):
@@ -179,10 +179,10 @@ class Pipeline(Strict):
     profiles: dict[str, Overrides]
     variants: dict[str, Overrides] = {}
     comparisons: dict[str, str] = {}
-    budget: dict[str, Annotated[float, Field(gt=0)]] = {}
+    budget: dict[str, PositiveFloat] = {}
     memory: dict[str, Memory] = {}
     durations: dict[str, dict[str, Rates]] = {}
-    gpus: dict[str, Annotated[float, Field(gt=0)]] = {}
+    gpus: dict[str, PositiveFloat] = {}
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:

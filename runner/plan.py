@@ -12,7 +12,7 @@ from typing import Any
 
 from runner import Refused, keys
 from runner.artifacts import ArtifactDiff, diff_artifact
-from runner.files import RECEIPT, list_files, read_receipt
+from runner.files import list_files, read_receipt
 from runner.keys import Inputs, digest, flatten_params
 from runner.pipeline import SCENE, Condition
 from runner.process import ask_stages
@@ -93,19 +93,8 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
             return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
     code = keys.code_fingerprints(job.root, stage, job.hashes)
     if open_questions:
-        return Decision("pending", open_questions[0], _existing_artifact(job, stage))
-    changing = [need for need, decision in needs.items() if not decision.is_final]
-    if changing:
-        path = _existing_artifact(job, stage)
-        found = path and read_receipt(path)
-        if not path or not found:
-            return Decision("run", "not run yet")
-        info = job.stages[stage]
-        same_needs = Inputs(info.params, found["needs"], found["weights"], code, info.unkeyed, info.unavailable)
-        if differences := _changes(job, found, same_needs) or _damage(job, diff_artifact(path, job.hashes)):
-            return Decision("run", join_names(differences), path)
-        return Decision("stale", f"waits for {', '.join(changing)}; kept if the new content is the same", path)
-    return _compare_receipts(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
+        return Decision("pending", open_questions[0], next(iter(_receipts(job, stage)), None))
+    return _compare_receipts(job, stage, needs, code)
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
@@ -159,9 +148,9 @@ def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
     return params[param] == value
 
 
-def _existing_artifact(job: ResolvedJob, stage: str) -> Path | None:
-    """Return the stage's artifact, maybe out of date, of the job, else of the scene's own run; None without any."""
-    return next((home / stage for home in (job.home, job.base) if (home / stage / RECEIPT).is_file()), None)
+def _receipts(job: ResolvedJob, stage: str) -> dict[Path, dict[str, Any]]:
+    """Return the stage's artifacts, maybe out of date, of the job and of the scene's own run, with their receipts."""
+    return {home / stage: found for home in (job.home, job.base) if (found := read_receipt(home / stage))}
 
 
 def _weights(job: ResolvedJob, stage: str) -> Iterator[tuple[str, str, Path | None]]:
@@ -183,7 +172,7 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].all_needs:
         hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
-        for path in keys.paths_outside(own.params, job.folder):
+        for path in job.paths_outside(stage):
             if job.folder.is_relative_to(path):
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
@@ -191,27 +180,31 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
     return Inputs(own.params, hashes, weights, code, own.unkeyed, own.unavailable)
 
 
-def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
-    """Return `cached` if a receipt, of the variant or else the scene, agrees with inputs and files; otherwise `run`."""
-    places = [home / stage for home in dict.fromkeys((job.home, job.base))]
-    receipts = [(place, found) for place in places if (found := read_receipt(place))]
-    reasons = ["not run yet"] * (not receipts)
-    for place, found in sorted(receipts, key=lambda receipt: bool(_changes(job, receipt[1], inputs))):
-        diff = diff_artifact(place, job.hashes)
-        if differences := _changes(job, found, inputs) or _damage(job, diff):
+def _compare_receipts(job: ResolvedJob, stage: str, needs: dict[str, Decision], code: dict[str, str]) -> Decision:
+    """Return `cached` or `stale` if a receipt, of the variant or the scene, agrees with inputs and files, else `run`.
+
+    A need that may still change is assumed to have the content that it had at the time of the receipt.
+    """
+    changing = [need for need, each in needs.items() if not each.is_final]
+    inputs = _inputs(job, stage, {need: each.path for need, each in needs.items() if each.is_final}, code)
+    receipts, reasons = _receipts(job, stage), []
+    for place, found in receipts.items():
+        assumed = replace(inputs, needs=inputs.needs | {need: found["needs"].get(need) for need in changing})
+        diff, code_changes = diff_artifact(place, job.hashes), keys.list_code_changes(found, assumed)
+        differences = keys.list_changes(found, assumed) + ([] if job.trust else code_changes)
+        if differences := differences or _damage(job, diff):
             reasons.append(join_names(differences))
-            continue
-        trusted = join_names(keys.list_code_changes(found, inputs))
-        shared = f"shared with {job.base.name}" if place.parent != job.home else ""
-        notes = filter(None, [f"trusted although {trusted}" if trusted else shared])
-        return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
+        elif changing:
+            return Decision("stale", f"waits for {', '.join(changing)}; kept if the new content is the same", place)
+        else:
+            shared = [f"shared with {job.base.name}"] if place.parent != job.home else []
+            notes = [f"trusted although {join_names(code_changes)}"] if code_changes else shared
+            return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
+    decision = Decision("run", reasons[0] if reasons else "not run yet", next(iter(receipts), None))
+    if changing:
+        return decision
     resumes = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    return Decision("run", reasons[0] + resumes, receipts[0][0] if receipts else None, False, inputs)
-
-
-def _changes(job: ResolvedJob, receipt: dict[str, Any], inputs: Inputs) -> list[str]:
-    """Describe the differences between a receipt and inputs, a phrase each; with `trust`, not those of code."""
-    return keys.list_changes(receipt, inputs) + ([] if job.trust else keys.list_code_changes(receipt, inputs))
+    return replace(decision, reason=decision.reason + resumes, inputs=inputs)
 
 
 def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
@@ -220,18 +213,6 @@ def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
     if diff.changed and not job.keep:
         found.append(f"{join_names(diff.changed)} changed since (keep=1 keeps it)")
     return found
-
-
-def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
-    """Return the decision, or the decision `missing` if the stage would run on CUDA and there is no GPU."""
-    # A cached artifact is valid on any machine.
-    if decision.status not in TO_DO or job.params[stage].get("device") != "cuda":
-        return decision
-    if has_cuda() if job.cuda is None else job.cuda:
-        return decision
-    cure = f'profile=laptop, or set="{stage}.device=cpu"'
-    where = "this machine has no CUDA driver" if job.cuda is None else "no machine of the cluster has a GPU"
-    return Decision("missing", f"{stage}.device is cuda, and {where}: {cure}")
 
 
 def partial_folder(job: ResolvedJob, stage: str, key: str) -> Path:
@@ -258,7 +239,7 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
     decisions = dict(done or {})
     for stage in stages:
         if stage not in decisions:
-            decisions[stage] = _check_device(job, stage, decide(job, stage, decisions))
+            decisions[stage] = decide(job, stage, decisions)
     questions = [_stage_question(job, stage, decisions) for stage in stages if decisions[stage].status not in FINAL]
     for question, answer in zip(questions, ask_stages(job.root, questions), strict=True):
         if "broken" in answer and not done:  # while a job runs, the user may still repair the stage
@@ -283,12 +264,11 @@ def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]
 
 def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
     """Add a stage's answer to its decision: `missing` if CUDA or needed weights are absent, or the stage refuses."""
-    needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
+    stage, needed, notes = question["stage"], tuple(answer.get("needed", ())), tuple(answer.get("notes", ()))
     if decision.status not in TO_DO:
         return replace(decision, needed=needed)
-    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # None: stages run on this machine
-        reason = f"{question['stage']}.device is cuda, and {absent[0]}"
-        return Decision("missing", reason, needed=needed, lacks=absent)
+    if absent := _missing_for_cuda(job, stage, answer):
+        return Decision("missing", f"{stage}.device is cuda, and {absent[0]}", needed=needed, lacks=absent)
     cure = f"`make weights profile={job.profile}` fetches it"
     lacks = [need for need in needed if need["problem"]]
     for need in (need for need in lacks if not need["optional"]):
@@ -299,3 +279,13 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
     if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # the needs are final
         decision = replace(decision, status="missing", reason=answer["refusal"])
     return replace(decision, notes=notes, needed=needed)
+
+
+def _missing_for_cuda(job: ResolvedJob, stage: str, answer: dict[str, Any]) -> tuple[str, ...]:
+    """Return what the machines lack for a stage on CUDA, a line each with the remedy; () for a stage on the CPU."""
+    if job.params[stage].get("device") != "cuda":
+        return ()
+    cure = f'profile=laptop, or set="{stage}.device=cpu"'
+    if job.cuda is None:  # stages run on this machine
+        return tuple(answer.get("lacks", ())) if has_cuda() else (f"this machine has no CUDA driver: {cure}",)
+    return () if job.cuda else (f"no machine of the cluster has a GPU: {cure}",)

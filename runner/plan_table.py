@@ -1,12 +1,8 @@
 """A plan as text, which `plan` prints, and `run` before it starts."""
 
 from collections import Counter
-from collections.abc import Iterable
-from pathlib import Path
 
-from runner.durations import expected_seconds, is_timed, total_time
-from runner.keys import files_outside, paths_outside
-from runner.pipeline import SCENE
+from runner.durations import seconds_left, total_time
 from runner.plan import Decision
 from runner.resolve import ResolvedJob
 from runner.text import format_bytes, format_seconds, join_names
@@ -20,30 +16,21 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     scene's folder from which files are read.
     """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
+    expected = seconds_left(job, decisions)
     for stage, decision in decisions.items():
-        seconds = expected_seconds(job, stage) if is_timed(job, decision) else None
+        seconds = expected.get(stage)
         time = f"~{format_seconds(seconds)}" if seconds is not None else ""
         lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
-    if total := total_time(job, decisions):
+    if total := total_time(expected):
         lines.append(f"  together about {total}" + (f"; GPU: {job.gpu}" if job.gpu else ""))
     rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
     lines += [f"  besides, {line}" for line in rest]
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {format_bytes(sum(sizes))}, by `make weights profile={job.profile}`")
-    paths = {path for stage in decisions for path in _paths_outside_scene(job, stage)}
+    paths = {path for stage in decisions for path in job.paths_outside(stage)}
     folders = Counter(str(path if path.is_dir() else path.parent) for path in sorted(paths))
     if named := [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]:
         lines.append(f"  read outside the scene's folder: {join_names(named)}")
     return "\n".join(lines)
-
-
-def _paths_outside_scene(job: ResolvedJob, stage: str) -> Iterable[Path]:
-    """Return the paths outside the scene's folder that a stage reads; scene.yaml or capture files name them."""
-    info = job.stages.get(stage)
-    if info is None or SCENE not in job.pipeline.stages[stage].all_needs:
-        return ()
-    if info.reads is None:
-        return paths_outside(info.params, job.folder)
-    return files_outside(info.reads, job.folder)

@@ -21,7 +21,6 @@ from runner.process import ask_stages
 
 AUTO = "auto"  # stands for the profile that suits this machine
 WORKER = Path(__file__).with_name("worker.py")
-CACHED = "answer "  # prefix of the keys in the cache of hashes under which answers of stages are cached
 
 
 @dataclass(frozen=True)
@@ -120,6 +119,14 @@ class ResolvedJob(Request):
         """Stage -> all its parameters, defaults included; groups are nested dicts."""
         return {stage: each.params for stage, each in self.stages.items()}
 
+    def paths_outside(self, stage: str) -> list[Path]:
+        """Return the paths outside the scene's folder that a stage reads; scene.yaml or capture files name them."""
+        info = self.stages[stage]
+        if info.reads is not None:
+            return files_outside(info.reads, self.folder)
+        takes_scene = SCENE in self.pipeline.stages[stage].all_needs
+        return list(paths_outside(info.params, self.folder)) if takes_scene else []
+
     def question(self, stage: str) -> dict[str, Any]:
         """Build the question to a stage about the weights that it needs, see `worker.describe`.
 
@@ -155,11 +162,7 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
     questions = [_questions(job) for job in drafts]
     new = {name: question for each in questions for name, question in each.items() if name not in hashes.known}
     answers = dict(zip(new, ask_stages(requests[0].root, list(new.values())), strict=True))
-    for key, answer in answers.items():
-        depends_on_machine = answer.get("unavailable") or answer.get("machine")
-        outside = files_outside(answer.get("reads") or (), Path(new[key].get("scene", ".")))
-        if key.startswith(CACHED) and "params" in answer and not depends_on_machine and not outside:
-            hashes.known[key] = answer
+    hashes.known |= {key: answer for key, answer in answers.items() if _is_lasting(new[key], answer)}
     return [_add_descriptions(job, each, hashes.known | answers) for job, each in zip(drafts, questions, strict=True)]
 
 
@@ -271,19 +274,28 @@ def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
 
 
 def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
-    """Return a key that changes with everything the answer depends on; a key that begins with CACHED may be cached."""
-    stage, plan, listed = question["stage"], "stages/plan", list_files(job.folder) if "scene" in question else ()
+    """Return the key in the cache of a question's answer: a hash of the question, of code, and of the scene's files."""
+    stage = question["stage"]
+    folder = "stages/plan" if (job.root / "stages/plan" / f"{stage}.py").is_file() else "stages"
     try:
-        folder = plan if (job.root / plan / f"{stage}.py").is_file() else "stages"
         code = code_fingerprints(job.root, stage, job.hashes, folder)
         code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
-    except Refused:  # the code is not valid Python, which the answer reports as broken
-        return json.dumps(question)
-    if "scene" in question and any(paths_outside(question["params"], job.folder)):
-        return json.dumps(question)  # the answer may depend on files outside the scene
+    except Refused as error:  # not valid Python, which no plan accepts
+        code = {"error": str(error)}
+    listed = list_files(job.folder) if "scene" in question else ()
     files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
-    # Caching saves the half second that a process that imports stages takes to start, and as much to find the files.
-    return CACHED + digest(json.dumps([question, code, job.hashes.file(WORKER), files]))
+    return "answer " + digest(json.dumps([question, code, job.hashes.file(WORKER), files]))
+
+
+def _is_lasting(question: dict[str, Any], answer: dict[str, Any]) -> bool:
+    """Return whether an answer depends on nothing that its key leaves out: this machine, and files outside the scene.
+
+    Caching such answers saves a process, which takes half a second to start, and as much to find the files.
+    """
+    if "params" not in answer or answer.get("machine") or answer.get("unavailable"):
+        return False
+    scene = Path(question.get("scene", "/"))  # without a scene no path is outside
+    return not files_outside(answer.get("reads", ()), scene) and not any(paths_outside(question["params"], scene))
 
 
 def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> ResolvedJob:

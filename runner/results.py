@@ -1,17 +1,14 @@
-"""Printing of a run's scores, records for report/, and calls of report/ for tables and pages."""
+"""Printing of a run's scores, and the record of a plan for report/."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from reffusion.command import is_installed, workplace
-from runner import Failed, say
+from runner import say
 from runner.durations import expected_seconds
 from runner.files import RECEIPT, read_json
 from runner.plan import Decision
-from runner.process import PROJECT
 from runner.resolve import Request, ResolvedJob
 from runner.text import display_path
 
@@ -83,26 +80,6 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
     entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
     stages = {stage: entry(d) | {"seconds": expected_seconds(job, stage)} for stage, d in decisions.items()}
     return {"profile": job.profile, "stages": stages, "params": unset.params}
-
-
-def write_table(record: Path) -> None:
-    """Run report/table.py, which writes the table of a batch to the folder of its record.
-
-    Args:
-        record: the JSON file with the record.
-
-    Raises:
-        Failed: the table could not be written.
-    """
-    if call_report("table", str(record)):
-        raise Failed(f"the table of {display_path(record)} could not be written (see above)")
-
-
-def call_report(module: str, *arguments: str) -> int:
-    """Run `python -m report.<module>` with these arguments, and return its exit code."""
-    path = os.pathsep.join(filter(None, [str(PROJECT), os.environ.get("PYTHONPATH", "")]))
-    command = [sys.executable, "-m", f"report.{module}", *arguments]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode
 
 
 def _format_score(value: Any) -> str:

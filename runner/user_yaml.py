@@ -1,29 +1,29 @@
 """Reading of YAML that people write, mainly scene.yaml.
 
-Names of views stay text even if they look like numbers or dates. Size, depth and number of values are limited.
+Names of views stay text even if they look like numbers or dates. Size and depth are limited. Tags are refused, and so
+are aliases, since few lines with them can mean billions of values.
 """
 
 import json
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.constructor import SafeConstructor
 
 from runner import Refused
 
 MAX_BYTES = 1_000_000  # largest size of a file
 MAX_DEPTH = 20  # largest number of nested lists and mappings
-MAX_VALUES = 10_000  # largest number of values; a value counts again for each alias that repeats it
-TAGS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))
+NULL = "tag:yaml.org,2002:null"
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A YAML loader that reads dates as text, because no value in these files is a date."""
+    """A YAML loader for which scalars are numbers, booleans, null or text: dates and `<<` are text."""
 
 
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in those if not tag.endswith(":timestamp")]
+    first: [(tag, pattern) for tag, pattern in those if tag.endswith((":int", ":float", ":bool", ":null"))]
     for first, those in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 
@@ -56,16 +56,14 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise Refused(f"{path}: not readable text: {error}; save it as UTF-8") from None
     try:
-        node, loader = _tree(text)
+        node = _parse(text)
         if node is None or _is_null(node):
             return {}
         if not isinstance(node, yaml.MappingNode):
-            raise Refused(f"{path}: expected `key: value` lines, found a {node.id}")
-        return {key: _value(loader, value, key not in typed) for key, value in _pairs(loader, node)}
-    except (yaml.YAMLError, ValueError) as error:
-        if line := _line_with_tab(text, error):
-            raise Refused(f"{path}: line {line}: a tab; YAML indents by blanks only") from None
-        raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+            raise ValueError(f"expected `key: value` lines, found a {node.id}")
+        return {key: _value(value, key not in typed) for key, value in _pairs(node).items()}
+    except ValueError as error:
+        raise Refused(f"{path}: {error}") from None
 
 
 def parse_value(text: str, is_text: bool) -> Any:
@@ -78,72 +76,59 @@ def parse_value(text: str, is_text: bool) -> Any:
     Raises:
         ValueError: the text is not valid YAML, or a limit of this module is exceeded.
     """
-    try:
-        node, loader = _tree(text)
-    except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from None
-    return None if node is None else _value(loader, node, is_text)
+    node = _parse(text)
+    return None if node is None else _value(node, is_text)
 
 
-def _line_with_tab(text: str, error: Exception) -> int | None:
-    """Return the number of the line at which YAML failed if this line has a tab, else None."""
-    mark, lines = getattr(error, "problem_mark", None), text.splitlines()
-    return mark.line + 1 if mark and mark.line < len(lines) and "\t" in lines[mark.line] else None
-
-
-def _tree(text: str) -> tuple[Any, Any]:
-    """Parse YAML within the module's limits to (root node or None, loader); raises ValueError or yaml.YAMLError."""
+def _parse(text: str) -> Any:
+    """Parse YAML to its root node, or None for an empty text; raises ValueError, also beyond the module's limits."""
     depth = 0
-    for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
-        starts = isinstance(event, yaml.CollectionStartEvent)
-        depth += starts - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise ValueError(f"line {event.start_mark.line + 1}: more than {MAX_DEPTH} levels deep")
-        tag = getattr(event, "tag", None)
-        if tag not in (None, "!", *TAGS):
-            raise ValueError(f"line {event.start_mark.line + 1}: the tag {tag!r:.60} is not understood; leave it out")
-    loader = _Loader(text)
-    node = loader.get_single_node()
-    waiting, seen = [node] if node else [], 0
-    while waiting:
-        each, seen = waiting.pop(), seen + 1
-        if seen > MAX_VALUES:
-            raise ValueError(f"more than {MAX_VALUES} values, with those that aliases (*) repeat")
-        if isinstance(each, yaml.CollectionNode):
-            waiting += [part for item in each.value for part in (item if isinstance(item, tuple) else (item,))]
-    return node, loader
+    try:
+        for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
+            line = f"line {event.start_mark.line + 1}"
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ValueError(f"{line}: more than {MAX_DEPTH} levels deep")
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{line}: the alias *{event.anchor:.60} is not understood; write the value itself")
+            if (tag := getattr(event, "tag", None)) not in (None, "!"):
+                raise ValueError(f"{line}: the tag {tag!r:.60} is not understood; leave it out")
+        return yaml.compose(text, _Loader)
+    except yaml.YAMLError as error:
+        mark, lines = getattr(error, "problem_mark", None), text.splitlines()
+        if mark and mark.line < len(lines) and "\t" in lines[mark.line]:
+            raise ValueError(f"line {mark.line + 1}: a tab; YAML indents by blanks only") from None
+        raise ValueError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
 
-def _pairs(loader: Any, node: yaml.MappingNode) -> list[tuple[str, Any]]:
-    """Return (key as text, value node) pairs, also those merged by `<<`; raises ValueError for bad or repeated keys."""
-    keys = Counter(_key(key) for key, _ in node.value)
-    if twice := [key for key, count in keys.items() if count > 1]:
-        raise ValueError(f"line {node.start_mark.line + 1}: the key {twice[0]!r:.60} comes twice; keep one")
-    loader.flatten_mapping(node)
-    return [(_key(key), value) for key, value in node.value]
+def _pairs(node: yaml.MappingNode) -> dict[str, yaml.Node]:
+    """Return key -> node of its value; raises ValueError for a key that is no text or comes twice."""
+    found: dict[str, yaml.Node] = {}
+    for key, value in node.value:
+        line = f"line {key.start_mark.line + 1}"
+        if not isinstance(key, yaml.ScalarNode):
+            raise ValueError(f"{line}: a key that is a list or a mapping")
+        if key.value in found:
+            raise ValueError(f"{line}: the key {key.value!r:.60} comes twice; keep one")
+        found[key.value] = value
+    return found
 
 
-def _key(node: Any) -> str:
-    if not isinstance(node, yaml.ScalarNode):
-        raise ValueError(f"line {node.start_mark.line + 1}: a key that is a list or a mapping")
-    return node.value
+def _is_null(node: yaml.Node) -> bool:
+    return isinstance(node, yaml.ScalarNode) and node.tag == NULL
 
 
-def _is_null(node: Any) -> bool:
-    return isinstance(node, yaml.ScalarNode) and node.tag == "tag:yaml.org,2002:null"
-
-
-def _value(loader: Any, node: Any, is_text: bool) -> Any:
+def _value(node: yaml.Node, is_text: bool) -> Any:
     """Construct a node's value; with `is_text` scalars stay text or None, and a null in a list raises ValueError."""
     if isinstance(node, yaml.SequenceNode):
-        if is_text and (empty := [each for each in node.value if _is_null(each)]):
-            what = (
-                f"`{empty[0].value}` in a list means nothing; put it in quotes if it is a name"
-                if empty[0].value
-                else ("an empty entry in a list; name something, or remove it")
-            )
-            raise ValueError(f"line {empty[0].start_mark.line + 1}: {what}")
-        return [_value(loader, each, is_text) for each in node.value]
+        for empty in filter(_is_null, node.value if is_text else ()):
+            what = "an empty entry in a list; name something, or remove it"
+            if empty.value:
+                what = f"`{empty.value}` in a list means nothing; put it in quotes if it is a name"
+            raise ValueError(f"line {empty.start_mark.line + 1}: {what}")
+        return [_value(each, is_text) for each in node.value]
     if isinstance(node, yaml.MappingNode):
-        return {key: _value(loader, value, is_text) for key, value in _pairs(loader, node)}
-    return None if _is_null(node) else node.value if is_text else loader.construct_object(node)
+        return {key: _value(value, is_text) for key, value in _pairs(node).items()}
+    if _is_null(node):
+        return None
+    return node.value if is_text else SafeConstructor().construct_object(node)

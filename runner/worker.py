@@ -27,7 +27,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TextIO, TypeGuard, get_args
+from typing import Any, TextIO, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -65,7 +65,7 @@ def describe() -> None:
     """
     questions = json.load(sys.stdin)
     output, sys.stdout = sys.stdout, sys.stderr  # modules may print, which must not mix with the answer
-    json.dump([_describe(question) for question in questions], output)
+    json.dump([_describe(question) for question in questions], output, default=asdict)
 
 
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
@@ -82,18 +82,23 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     try:
         params = planned.Params(**question["params"])
     except ValidationError as error:
-        return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
+        return {"errors": [_error(e, planned.Params, list(fields)) for e in error.errors()], "known": list(fields)}
+    ask = lambda function, *arguments: getattr(planned, function, lambda *_: None)(*arguments)
     marked = lambda mark, value: [name for name, marks in fields.items() if (marks or {}).get(mark) is value]
     answer = {"params": params.model_dump(mode="json"), "weights": marked("weights", True)}
     answer |= {"unkeyed": marked("keyed", False), "programs": marked("program", True)}
-    if hasattr(planned, "machine_facts"):
-        answer["machine"] = planned.machine_facts(params)
-    if hasattr(planned, "unavailable"):
-        answer["unavailable"] = planned.unavailable(params)
+    answer |= {"machine": ask("machine_facts", params), "unavailable": ask("unavailable", params)}
     if "brings" in question:
-        answer |= _describe_lacks(planned, params, stage, frozenset(question["brings"]))
+        answer["needed"] = ask("needed_weights", params, frozenset(question["brings"]))
+        answer["optional"] = ask("optional_weights", params)
+        if getattr(params, "device", "cpu") == "cuda" and CUDA_FILE.is_file():
+            answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, params)
     if "scene" in question:
-        answer |= _describe_scene(planned, params, Path(question["scene"]))
+        scene = Path(question["scene"])
+        reads = ask("scene_files", params, scene, list(list_files(scene)))
+        answer["reads"] = reads and sorted(map(str, reads))
+        with suppress(ValueError):  # the stage's preview reports this error
+            answer["facts"] = ask("scene_facts", params, scene)
     if "needs" in question and hasattr(planned, "preview"):
         needs = {name: path and Path(path) for name, path in question["needs"].items()}
         try:
@@ -102,30 +107,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
             answer["refusal"] = format_error(error)
         except Exception as error:
             answer["notes"] = [f"(its preview failed: {format_error(error)})"]
-    return answer
-
-
-def _describe_lacks(planned: Any, params: Any, stage: str, brings: frozenset[str]) -> dict[str, Any]:
-    """Return the weights that a stage needs and could use, and what this machine lacks for CUDA."""
-    answer = {}
-    if hasattr(planned, "needed_weights"):
-        answer["needed"] = [asdict(need) for need in planned.needed_weights(params, brings)]
-    if hasattr(planned, "optional_weights"):
-        answer["optional"] = [asdict(need) for need in planned.optional_weights(params)]
-    if getattr(params, "device", "cpu") == "cuda" and CUDA_FILE.is_file():
-        answer["lacks"] = import_file(CUDA_FILE).find_missing(stage, params)
-    return answer
-
-
-def _describe_scene(planned: Any, params: Any, scene: Path) -> dict[str, Any]:
-    """Return which files of the scene a stage reads, and which facts about it the stage depends on."""
-    answer: dict[str, Any] = {}
-    if hasattr(planned, "scene_files"):
-        answer["reads"] = sorted(map(str, planned.scene_files(params, scene, list(list_files(scene)))))
-    if hasattr(planned, "scene_facts"):
-        with suppress(ValueError):  # the stage's preview reports this error
-            answer["facts"] = planned.scene_facts(params, scene)
-    return answer
+    return {name: value for name, value in answer.items() if value is not None}
 
 
 def _check_run(path: Path, takes: list[str]) -> None:
@@ -133,10 +115,9 @@ def _check_run(path: Path, takes: list[str]) -> None:
     # The source is parsed and not imported, because stages may import heavy modules.
     named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
     run = named["run"]
-    plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
-    free = {*plain[len(plain) - len(run.defaults) :], *(n for n, d in zip(needs, run.kw_defaults, strict=True) if d)}
-    wrong = {*plain, *needs} - free - {*takes} or (set() if run.kwarg else {*takes} - {*plain, *needs})
-    if wrong:
+    defaults = {each.arg: default for each, default in zip(run.kwonlyargs, run.kw_defaults, strict=True)}
+    required = {need for need, default in defaults.items() if default is None}
+    if wrong := required - {*takes} or (set() if run.kwarg else {*takes} - {*defaults}):
         raise ValueError(f"run() and pipeline.yaml do not agree on its needs: {', '.join(sorted(wrong))}")
 
 
@@ -144,35 +125,26 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
     """Yield the dotted name and the json_schema_extra of each parameter of a model, and of those in its groups."""
     for name, info in model.model_fields.items():
         yield prefix + name, info.json_schema_extra
-        if _is_group(info.annotation):
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):  # a group of parameters
             yield from _fields(info.annotation, f"{prefix}{name}.")
 
 
-def _is_group(annotation: Any) -> TypeGuard[type[BaseModel]]:
-    """Return whether a parameter with this annotation is a group of parameters."""
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
+def _error(error: Any, model: type[BaseModel], known: list[str]) -> dict[str, Any]:
     """Convert an entry of pydantic's `ValidationError.errors()`; "unknown" means that no parameter has this name."""
-    where, value, group = _place(error["loc"], model), error["input"], model
-    for part in where[:-1]:
-        group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
-    unknown = error["type"] == "extra_forbidden" and _is_group(group)
-    while unknown and isinstance(value, dict) and value:
-        name, value = next(iter(value.items()))
-        where.append(str(name))
-    message = error["msg"].removeprefix("Value error, ")
-    return {"where": ".".join(where) or "?", "unknown": unknown, "value": reprlib.repr(value), "message": message}
-
-
-def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
-    """Return the names that lead to a wrong value in a model, from the location that pydantic gives."""
-    field = model.model_fields.get(loc[0]) if loc else None
-    alternatives = [kind for kind in get_args(field.annotation) if kind is not NoneType] if field else []
+    first, *names = error["loc"] or ("?",)
+    kind = model.model_fields[first].annotation if first in model.model_fields else None
     # Of a parameter with alternative types, such as `str | list[str]`, the location also names the type that was tried.
-    tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
-    return [str(part) for part in (loc[:1] + loc[2:] if tried else loc)]
+    if isinstance(kind, UnionType) and len({*get_args(kind)} - {NoneType}) > 1:
+        names = names[1:]
+    where = ".".join(map(str, (first, *names)))
+    group, _, _ = where.rpartition(".")
+    unknown = error["type"] == "extra_forbidden" and (not group or any(n.startswith(f"{group}.") for n in known))
+    value = error["input"]
+    while unknown and isinstance(value, dict) and value:  # of an unknown group, its first parameter is named
+        name, value = next(iter(value.items()))
+        where += f".{name}"
+    message = error["msg"].removeprefix("Value error, ")
+    return {"where": where, "unknown": unknown, "value": reprlib.repr(value), "message": message}
 
 
 def frames() -> int:
@@ -237,7 +209,7 @@ def _limit_resources(cores: int | None, on: list[int] | None, gpus: str | None) 
     if cores is not None:
         os.environ |= {f"{library}_NUM_THREADS": str(cores) for library in THREADS}
         os.environ["OPENCV_FOR_THREADS_NUM"] = str(cores)
-    if on and hasattr(os, "sched_setaffinity"):  # some libraries read no variable, but ask the system for its cores
+    if on:  # some libraries read no variable, but ask the system for its cores
         os.sched_setaffinity(0, on)
     if gpus is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus
@@ -269,9 +241,8 @@ def _end_with_runner(fd: int) -> None:
 
 def _peak_memory_mb() -> int:
     """Return the peak memory of this process, or of its largest child process if that is more, in MB."""
-    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes there, in kB elsewhere
-    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return round(largest * unit / 2**20)
+    kilobytes = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return round(max(kilobytes) / 1024)
 
 
 if __name__ == "__main__":

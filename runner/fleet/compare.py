@@ -7,20 +7,23 @@ scene's own run.
 
 import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from reffusion.command import scene_name
-from runner import Refused, say
+from runner import Failed, Refused, say
 from runner.execute import Execution
 from runner.files import write_json
 from runner.fleet.engine import LocalEngine
 from runner.fleet.parallel import Outcome, SceneRun, run_all
 from runner.keys import HASHES, Hashes
 from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown_name
+from runner.process import PROJECT
 from runner.resolve import Request, resolve_all
-from runner.results import mean_scores, write_table
+from runner.results import mean_scores
 from runner.text import display_path
 
 FULL = "full"  # name of the full method: a variant of this name, or else the scene's own run
@@ -187,3 +190,23 @@ def batch(request: Request, folder: Path, execution: Execution | None = None) ->
     table = display_path(record.with_suffix(""))
     say(f"{len(runs) - len(failed)} of {len(runs)} scenes done; table: {table}.csv and .md")
     return len(failed)
+
+
+def write_table(record: Path) -> None:
+    """Run report/table.py, which writes the table of a batch to the folder of its record.
+
+    Args:
+        record: the JSON file with the record.
+
+    Raises:
+        Failed: the table could not be written.
+    """
+    if call_report("table", str(record)):
+        raise Failed(f"the table of {display_path(record)} could not be written (see above)")
+
+
+def call_report(module: str, *arguments: str) -> int:
+    """Run `python -m report.<module>` with these arguments, and return its exit code."""
+    path = os.pathsep.join(filter(None, [str(PROJECT), os.environ.get("PYTHONPATH", "")]))
+    command = [sys.executable, "-m", f"report.{module}", *arguments]
+    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode

@@ -5,15 +5,17 @@ The downloads are made by a process of their own, `python -m runner.fleet.weight
 
 import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from runner.process import ask_stages, start_worker
-from runner.resolve import Request, resolve
 from runner.text import format_bytes, format_error
 from runner.worker import description_file, import_file
 
+if TYPE_CHECKING:
+    from runner.resolve import Request
 
-def fetch_weights(request: Request, offline: bool) -> int:
+
+def fetch_weights(request: "Request", offline: bool) -> int:
     """List the weights that all stages need or could use, and download the missing ones, optional ones too.
 
     Args:
@@ -24,6 +26,8 @@ def fetch_weights(request: Request, offline: bool) -> int:
         Number of missing weights that are not optional and cannot be downloaded, or with `offline` are not downloaded;
         and of downloads that failed.
     """
+    from runner.resolve import resolve  # not in the process of `fetch`, which may see another package reffusion
+
     job = resolve(request, scene=bool(request.scene))
     answers = list(zip(job.stages, ask_stages(job.root, list(map(job.question, job.stages))), strict=True))
     all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
