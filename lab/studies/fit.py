@@ -28,7 +28,7 @@ VARIANTS = {  # name -> differences from the profile's parameters of `fit`
     "laptop, half the steps": {"iterations": 800},
     "laptop, twice the steps": {"iterations": 3200},
     "laptop, .4 Gaussians a pixel": {"densify.per_pixel": 0.4},
-    "fine": {"iterations": 6000, "densify.per_pixel": 2},
+    "fine": {"iterations": 6000, "densify.stop": 0.6, "densify.per_pixel": 2},
     "sparse points only": {"init.flow_cell": 0},
     "antialiased": {"antialiased": True},
     "exposure": {"exposure": "always"},
