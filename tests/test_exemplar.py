@@ -338,8 +338,7 @@ def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
     depth[60:] = 1.0
     hidden = np.zeros((120, 160), bool)
     hidden[30:90, 60:100] = True
-    found, layer = exemplar._interpolate_depth(depth, ~hidden, hidden)
+    found = exemplar._interpolate_depth(depth, ~hidden, hidden)
     assert np.allclose(found[30:60, 60:100], 4, rtol=0.01) and np.allclose(found[61:90, 60:100], 1, rtol=0.01)
-    assert (layer[61:90, 60:100] == 1).all() and (layer[30:60, 60:100] == 0).all() and layer[0, 0] == -1
-    alone, layer = exemplar._interpolate_depth(np.full((120, 160), 2.0), ~hidden, hidden)
-    assert np.allclose(alone, 2, rtol=0.01) and layer.max() == 0
+    alone = exemplar._interpolate_depth(np.full((120, 160), 2.0), ~hidden, hidden)
+    assert np.allclose(alone, 2, rtol=0.01)

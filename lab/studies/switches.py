@@ -78,8 +78,6 @@ TEXTURE = {  # judged first on the picture of the reference
         "reference", replaced={INPAINT + "exemplar._choose_others": lambda own, views: []}
     ),
     "patches in perspective": Switch("reference", replaced={INPAINT + "exemplar._roughness": lambda *_: np.inf}),
-    "foreground layers": Switch("reference", replaced={INPAINT + "exemplar.MIN_LAYER_SHARE": np.inf}),
-    "normals of patches": Switch("reference", replaced={INPAINT + "patchmatch.completion.NORMAL_FEATURE": 0.0}),
     "patches blended by gradients": Switch(
         "reference",
         replaced={INPAINT + "patchmatch.completion.blend": lambda current, hole, right, below, own: own[hole]},

@@ -220,26 +220,6 @@ def segment_surfaces(
     return result
 
 
-def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return int [H, W], the foreground objects around a hole, numbered 1, 2, ...; 0 at all other pixels.
-
-    A foreground object is a connected segment that is nearer than everything it touches in a band around the hole (see
-    `segment_surfaces`).
-
-    Args:
-        disparity: [H, W], read where `known`.
-        known: bool [H, W].
-        hole: bool [H, W].
-    """
-    result, index = np.zeros(known.shape, np.int64), np.full(known.shape, -1)
-    index[known] = np.arange(known.sum())
-    if known.any() and hole.any():
-        first, second = _smooth_neighbor_pairs(index, disparity[known])
-        links = sparse.csr_matrix((np.ones(len(first)), (first, second)), shape=(int(known.sum()),) * 2)
-        result[known] = _label_foreground(links, disparity, known, hole)
-    return result
-
-
 def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return int [E] and int [E], the numbers of neighboring pixels without a jump in disparity between them."""
     firsts, seconds = [], []

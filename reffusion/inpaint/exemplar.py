@@ -13,7 +13,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from reffusion import geometry
 from reffusion.background.mirrors import MirrorImage, render_mirrors
@@ -21,8 +20,7 @@ from reffusion.background.model import Background
 from reffusion.background.plane import Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView
 from reffusion.depth.inpaint_depth import inpaint_depth
-from reffusion.depth.layers import segment_foreground, segment_surfaces
-from reffusion.inpaint.normals import mean_normals
+from reffusion.depth.layers import segment_surfaces
 from reffusion.inpaint.patchmatch.completion import Completion, complete
 from reffusion.inpaint.plane_frames import label_planes, plane_coordinates, plane_jacobians
 from reffusion.inpaint.poisson import paste
@@ -34,7 +32,7 @@ from reffusion.morphology import convex_hull, dilate, disk, to_pixels
 from reffusion.types import Camera
 
 OTHER_PHOTOS = 3  # photographs, besides the view's own, from which patches are taken
-RING = 0.12  # of the image's width: width of the ring around the object in which foreground layers are separated
+RING = 0.12  # of the image's width: width of the ring around the object whose surfaces are continued
 SOURCE_REACH = 4.0  # patches are taken within this many radii of the object around its middle
 RIM_WIDTH = 0.006  # of the image's width: width of the mask's rim, which is painted too
 MIN_KEPT_RADIUS = 0.02  # of the image's width: observed parts of C too narrow for a disk of this radius are painted too
@@ -46,7 +44,6 @@ PLANE_SAMPLE_REACH = 2.5
 MIN_PLANE_PIXELS = 200  # pixels of this kind that a view must have to take part in the roughness of a plane
 SMOOTH = 0.01  # roughness up to which a plane is smooth; grass and rock are rougher
 SMOOTH_IF_REPEATING = 0.02  # the same for a plane whose texture repeats itself, as planks and tiles do, not grass
-MIN_LAYER_SHARE = 0.02  # share of the hole into which a foreground layer must continue; others end beside the hole
 
 
 def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
@@ -122,19 +119,14 @@ def _find_surfaces(
 ) -> tuple[SourceImage, list[SourceImage], list[int], dict[int, PlaneSymmetry]]:
     """Return the target, the sources, the indices of smooth planes, and plane index -> symmetry of its texture."""
     own = next(view for view in around.views if view.camera.name == camera.name)
-    plane, depth, layer = _surfaces_behind(own, hidden, hole | hidden, around.planes, mirrored)
-    counts = np.bincount(layer[hole].clip(0), minlength=layer.max() + 1)
-    layer[(layer > 0) & (counts < MIN_LAYER_SHARE * hole.sum())[layer]] = 0
-    layers = _LayerLookup(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
+    plane, depth = _surfaces_behind(own, hidden, hole | hidden, around.planes, mirrored)
     jacobians, coordinates = (of(plane, camera, around.planes) for of in (plane_jacobians, plane_coordinates))
-    all_layers = layer.clip(0) if layers is None else np.where(layer >= 0, layer, layers.in_view(own))
-    normals = mean_normals(depth, np.ones_like(hole), camera)
-    target = SourceImage(image, hole, ~hole, plane, jacobians, depth / camera.fx, coordinates, all_layers, normals)
+    target = SourceImage(image, hole, ~hole, plane, jacobians, depth / camera.fx, coordinates)
     others = [(view, around.photos[view.camera.name]) for view in _choose_others(own, around.views)]
-    first = _source_image(own, around.photos[camera.name], around, layers, with_reflections=True)
+    first = _source_image(own, around.photos[camera.name], around, with_reflections=True)
     beside = ndimage.distance_transform_edt(~hole) < np.sqrt(hole.sum())
     sources = [replace(first, usable=first.usable | beside & (own.depth > 0))]
-    sources += [_source_image(*each, around, layers) for each in (*others, *around.completed)]
+    sources += [_source_image(*each, around) for each in (*others, *around.completed)]
     roughness = {k: _roughness(each, around) for k, each in enumerate(around.planes, start=1)}
     even = [k for k, rough in roughness.items() if rough < SMOOTH_IF_REPEATING and (plane == k)[hole].any()]
     symmetries = {k: symmetry for k in even if (symmetry := _symmetry_of(k, sources)) is not None}
@@ -156,84 +148,47 @@ def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | 
 
 def _surfaces_behind(
     own: DepthView, hidden: np.ndarray, pixels: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the plane index (0: none), depth and foreground layer [H, W] that a view would show without the object."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the plane index (0: none) and the depth [H, W] that a view would show without the object."""
     # `hidden` is C; `pixels` is C and the hole, which includes C's rim.
     surface = remove_reflected_depth(own.depth, own.camera, planes)
     known = (surface > 0) & ~hidden
-    depth, layer = _interpolate_depth(surface, known, hidden)
+    depth = _interpolate_depth(surface, known, hidden)
     plane, nearest = np.where(hidden, 0, label_planes(surface, own.camera, planes)), np.full(hidden.shape, np.inf)
     # A pixel shows the nearest plane that other views see there or that continues there, or a mirror image. If there is
-    # neither, its depth and layer are interpolated from the surroundings.
+    # neither, its depth is interpolated from the surroundings.
     for k, each in enumerate(planes, start=1):
         at = each.depth(own.camera)
         cells = each.seen | each.enclosed | each.continued | each.reflective
         possible = hidden | (at < (1 + geometry.OTHER_SURFACE) * surface)
         mine = each.pixels_on(cells, at, own.camera, pixels & possible) & (at < nearest)
         plane[mine], nearest[mine] = k, at[mine]
-    for k in range(1, len(planes) + 1):
-        beside = (plane == k) & ~hidden & (layer >= 0)
-        layer[hidden & (plane == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
     # A plane may cut through a round thing; there the mirror image of the thing wins.
     image = mirrored.plausible_depth < (1 + geometry.OTHER_SURFACE) * nearest
-    if image.any():
-        thing = known & (layer >= 0) & _same_depth(surface, mirrored.depth)
-        layer[image] = np.bincount(layer[thing]).argmax() if thing.any() else 0
-        plane[image], nearest[image] = 0, mirrored.plausible_depth[image]
-    return plane, np.where(np.isfinite(nearest), nearest, depth), layer
+    plane[image], nearest[image] = 0, mirrored.plausible_depth[image]
+    return plane, np.where(np.isfinite(nearest), nearest, depth)
 
 
-def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate depth across the hidden pixels; return it, and the foreground layer, int [H, W], of each pixel."""
+def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Return depth [H, W], interpolated across the hidden pixels."""
     if not known.any():
-        return np.ones(depth.shape), np.zeros(depth.shape, np.int64)
+        return np.ones(depth.shape)
     across = inpaint_depth(depth, known)
     result = np.where(across > 0, across, np.median(depth[known]))
     ring = known & dilate(hidden, RING)
-    disparity = geometry.reciprocal(depth)
-    piece, foreground = segment_surfaces(disparity, ring, hole=hidden), segment_foreground(disparity, ring, hidden)
-    # 1, 2, ... for surfaces nearer than all they touch beside the hidden pixels, 0 for other pixels, -1 beyond the ring
-    layer = np.where(ring, foreground, np.where(hidden, 0, -1))
+    piece = segment_surfaces(geometry.reciprocal(depth), ring, hole=hidden)
     far_first = lambda k: -float(np.median(depth[piece == k]))
     # Each piece of the surroundings, which are split where depth jumps, is continued by itself. A nearer piece reaches
     # as far as its convex hull in the image, so that it ends at the straight continuation of its visible borders.
     for position, k in enumerate(sorted(range(1, piece.max() + 1), key=far_first)):
         own = inpaint_depth(depth, piece == k)
         mine = hidden & (own > 0) & (convex_hull(piece == k) if position else True)
-        result[mine], layer[mine] = own[mine], np.bincount(foreground[piece == k]).argmax()
-    return result, layer
-
-
-class _LayerLookup:
-    """The foreground layers of one view, which can be looked up for the surface points of other views."""
-
-    def __init__(self, points: np.ndarray, layer: np.ndarray):
-        """Store the layers of a view.
-
-        Args:
-            points: [H, W, 3], the surface points of the view, in the world.
-            layer: int [H, W], the layer of each pixel; -1 where unknown.
-        """
-        known = (layer >= 0) & (np.indices(layer.shape).sum(0) % 2 == 0)
-        self._tree, self._layer = cKDTree(points[known]), layer[known]
-
-    def in_view(self, view: DepthView) -> np.ndarray:
-        """Return int [H, W], for each pixel of another view the layer of the nearest stored point.
-
-        It is 0 where that view has no depth.
-        """
-        layer = np.zeros(view.depth.shape, np.int64)
-        opaque = view.depth > 0
-        layer[opaque] = self._layer[self._tree.query(geometry.unproject(view.depth, view.camera)[opaque])[1]]
-        return layer
+        result[mine] = own[mine]
+    return result
 
 
 def _source_image(
-    view: DepthView,
-    image: np.ndarray,
-    around: Background,
-    layers: _LayerLookup | None = None,
-    with_reflections: bool = False,
+    view: DepthView, image: np.ndarray, around: Background, with_reflections: bool = False
 ) -> SourceImage:
     """Convert a view to a source of texture, whose usable pixels show surfaces near the object."""
     depth = remove_reflected_depth(view.depth, view.camera, around.planes)
@@ -244,10 +199,8 @@ def _source_image(
     plane = label_planes(depth, view.camera, around.planes)
     pixel_size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     jacobians, coordinates = (of(plane, view.camera, around.planes) for of in (plane_jacobians, plane_coordinates))
-    layer = np.zeros_like(plane) if layers is None else layers.in_view(view)
-    normals = mean_normals(depth, (depth > 0) & ~view.masked, view.camera)
     masked = dilate(view.masked, MASK_MARGIN)
-    return SourceImage(image, masked, usable, plane, jacobians, pixel_size, coordinates, layer, normals)
+    return SourceImage(image, masked, usable, plane, jacobians, pixel_size, coordinates)
 
 
 def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:

@@ -20,9 +20,6 @@ class SourceImage:
             matrix for pixels on no plane.
         pixel_size: [H, W], length of a pixel on the surface, in world units.
         plane_xy: [H, W, 2], the pixel's coordinates on its plane; meaningless for pixels on no plane.
-        layer: int [H, W], index of the foreground layer that the pixel shows, 1, 2, ...; 0 for none. A foreground layer
-            is a surface that is nearer than all surfaces it touches beside the hole.
-        normal: [H, W, 3], the mean normal of the surface, see `normals.mean_normals`; zeros where unknown.
     """
 
     image: np.ndarray
@@ -32,17 +29,14 @@ class SourceImage:
     to_plane: np.ndarray
     pixel_size: np.ndarray
     plane_xy: np.ndarray
-    layer: np.ndarray
-    normal: np.ndarray
 
 
 def without_geometry(image: np.ndarray, hole: np.ndarray) -> SourceImage:
-    """Return an image whose surfaces are unknown: no planes, layers or normals, and pixels of one size.
+    """Return an image whose surfaces are unknown: no planes, and pixels of one size.
 
     Args:
         image: uint8 [H, W, 3].
         hole: bool [H, W]; these pixels are masked, and all others usable.
     """
     identity, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
-    plane_xy, normal = np.zeros((*hole.shape, 2)), np.zeros((*hole.shape, 3), np.float32)
-    return SourceImage(image, hole, ~hole, none, identity, np.ones(hole.shape), plane_xy, none, normal)
+    return SourceImage(image, hole, ~hole, none, identity, np.ones(hole.shape), np.zeros((*hole.shape, 2)))

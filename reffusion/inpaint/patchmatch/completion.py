@@ -30,9 +30,7 @@ SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
 # Weights of the features by which patches are compared, beside the colors in levels of 255
 ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient, which distinguishes gravel from a wall of the same color
 PLANE_FEATURE = 50.0  # levels by which two smooth planes differ
-LAYER_FEATURE = 75.0  # levels by which two foreground layers differ
-NORMAL_FEATURE = 40.0  # levels per difference of normals
-CHANNELS, VOTED = 9, 5  # features; the first ones, on which patches vote, since the others are known in the hole too
+CHANNELS, VOTED = 6, 5  # features; the first ones, on which patches vote, since the others are known in the hole too
 ROUGHNESS_WINDOW = 15  # px, side of the window of the local mean gradient
 TRUST_FALLOFF = 1.2  # factor by which trust falls with each pixel inwards from the hole's border
 MIN_TRUST = 0.02
@@ -156,13 +154,12 @@ def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
 
 
 def _with_geometry(values: np.ndarray, source: SourceImage, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """Append a channel for plane and layer, and the normal, to features [h, w, 5] at full size divided by `scale`."""
+    """Append a channel for the plane to features [h, w, 5] at full size divided by `scale`."""
     of_plane = np.zeros(max([*smooth, int(source.plane.max())]) + 1, np.float32)
     of_plane[list(smooth)] = PLANE_FEATURE * np.arange(1, len(smooth) + 1)
     # A patch that covers the edge between two surfaces must show the same edge.
-    marks = of_plane[source.plane] + LAYER_FEATURE * source.layer.astype(np.float32)
-    marks, normal = cv2.medianBlur(marks, 5)[..., None], NORMAL_FEATURE * source.normal
-    return np.concatenate([values, *(each[::scale, ::scale] for each in (marks, normal))], -1)
+    marks = cv2.medianBlur(of_plane[source.plane], 5)[..., None]
+    return np.concatenate([values, marks[::scale, ::scale]], -1)
 
 
 def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
