@@ -11,7 +11,7 @@ import numpy as np
 
 from reffusion.types import Camera
 
-# Relative differences of depth that say how two surfaces lie. Between the first two nothing is certain.
+# Relative differences of depth by which two surfaces are compared. Between the first two, neither holds.
 SAME_SURFACE = 0.02  # up to this difference, two renderings show the same surface, or a rendering shows a plane
 OTHER_SURFACE = 0.03  # from this difference on, one surface lies in front of the other
 SAME_IF_MEASURED = 0.01  # as SAME_SURFACE, for depth from plane sweep stereo, which is more exact than rendered depth

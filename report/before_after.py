@@ -13,7 +13,7 @@ from reffusion.io.images import image_size, load_image
 from reffusion.io.scene import has_object_mask
 from report import inline_images, page
 from report.job_data import JobFiles
-from report.results import load_views
+from report.results import load_view_scores
 
 MEGABYTES = 3.0  # approximate size of all pictures together
 MIN_SIDE, MAX_SIDE = 320, 960  # longer side of a picture, px
@@ -96,7 +96,7 @@ def before_after_section(job: JobFiles) -> list[str]:
     count = sum(len(pictures) for pictures in views.values())
     longest = inline_images.affordable_side(count, MEGABYTES, MIN_SIDE, MAX_SIDE, width / height)
     kinds = [kind for kind in TITLES if any(kind in pictures for pictures in views.values())]
-    rows = load_views(job.folders["evaluate"] / "per_view.csv")
+    rows = load_view_scores(job.folders["evaluate"] / "per_view.csv")
     pairs = [
         _pair(name, pictures, rows.get(name, {}), longest, first=k == 0)
         for k, (name, pictures) in enumerate(views.items())

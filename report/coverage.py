@@ -14,7 +14,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask
 from report import page
 from report.job_data import JobFiles
-from report.results import load_views
+from report.results import load_view_scores
 
 HEADER = ("view", "mask, of the picture", "made up, of the mask", "uncovered, of the mask")
 MIN_UNCOVERED = 0.01  # a view is listed if a larger share is uncovered or unseen; `initialize` warns of the same views
@@ -83,7 +83,7 @@ def _bar(share: float | None) -> str:
 
 def _unseen(job: JobFiles) -> list[str]:
     """Return a paragraph on test views with over 1 % of pixels outside the mask unseen in training; [] if none."""
-    rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
+    rows = load_view_scores(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
     shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}
     if not shares:
         return []

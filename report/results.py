@@ -161,7 +161,7 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
         folders,
         load_receipts(folders),
         load_json(metrics) if metrics.is_file() else {},
-        load_views(evaluate / "per_view.csv"),
+        load_view_scores(evaluate / "per_view.csv"),
     )
 
 
@@ -178,7 +178,7 @@ def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
     return {stage: load_json(path) for stage, path in paths.items() if path.is_file()}
 
 
-def load_views(path: Path) -> dict[str, dict[str, float]]:
+def load_view_scores(path: Path) -> dict[str, dict[str, float]]:
     """Load per_view.csv as {view: {column: number}}, in the file's order; empty if the file does not exist.
 
     Cells that are empty or no numbers are left out. A PSNR is at most `PSNR_CAP`, also where a view equals the ground

@@ -16,7 +16,7 @@ from reffusion.io.scene import save_references, save_teaching
 from reffusion.params.reference import Params
 from reffusion.references import view_ranking
 from reffusion.references.adoption import adopt_references
-from reffusion.references.completion import Candidates, complete_view
+from reffusion.references.completion import Candidates, complete_best_view
 from reffusion.references.files import list_teaching_files, load_reference_files
 from reffusion.workspace import Workspace
 
@@ -43,7 +43,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     if files:
         references, fits = adopt_references(files, space)
     else:
-        reference, candidates = complete_view(params, space, out / "candidates")
+        reference, candidates = complete_best_view(params, space, out / "candidates")
         references, fits = [reference], {}
         save_candidates(out, reference.camera.name, candidates)
     save_references(out, references)

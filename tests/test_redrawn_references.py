@@ -21,7 +21,7 @@ from reffusion.io.images import save_image
 from reffusion.params.reference import ReferenceSpec
 from reffusion.references import changes, color, registration
 from reffusion.references.files import load_reference_files
-from reffusion.shadows.reference_shadows import detect_shadows
+from reffusion.shadows.reference_shadows import detect_shadow
 
 pytestmark = pytest.mark.integration
 
@@ -58,7 +58,7 @@ def test_a_redrawn_picture_of_the_view_is_accepted(variant):
     image = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
     low = lambda picture: cv2.GaussianBlur(picture, (0, 0), 3)
     assert psnr(low(image), low(truth), hole) > 35, "the colours and the place of what fills the hole"
-    assert (detect_shadows(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
+    assert (detect_shadow(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
     away = cv2.dilate(hole.astype(np.uint8), np.ones((17, 17))) == 0
     usual = changes.redrawn_difference(image, photo, away)
     assert changes.changed_pixels(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"

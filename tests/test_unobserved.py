@@ -236,9 +236,9 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     truth = np.clip(np.full((SIZE, SIZE, 3), 140) + grain, 0, 255).astype(np.uint8)
     photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
     photo[5:25, 5:25] = 40  # another difference, far from the mask
-    found = reference_shadows.detect_shadows(truth, photo, hidden)
+    found = reference_shadows.detect_shadow(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
-    assert not reference_shadows.detect_shadows(truth, truth, hidden).any()
+    assert not reference_shadows.detect_shadow(truth, truth, hidden).any()
     points = geometry.unproject(render_table(other.camera)[0], other.camera)
     same = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, own_light = reference_shadows.project_shadow(

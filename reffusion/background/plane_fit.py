@@ -49,13 +49,13 @@ def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView
 def search_planes(
     points: np.ndarray, inlier_distance: float, generator: np.random.Generator, least: float, claimed: float = 1.0
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """Find planes one after the other by RANSAC, about by decreasing number of points.
+    """Find planes one after the other by RANSAC, roughly in the order of decreasing numbers of inliers.
 
     Args:
         points: [P, 3].
         inlier_distance: distance from a plane below which a point is an inlier.
         least: number of inliers below which the search ends.
-        claimed: in inlier distances: later planes do not use points that are nearer to an earlier plane than this.
+        claimed: later planes use only points at least this many inlier distances from each earlier plane.
 
     Yields:
         Unit normal [3] of either sign, and offset.
@@ -88,7 +88,7 @@ def _ransac_plane(
 def refine_by_points(
     normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float, min_spread: float
 ) -> tuple[np.ndarray, float] | None:
-    """Return a plane, which was fitted to rendered depth, after a refit to the sparse points near it.
+    """Refit a plane to the sparse points near it; it was fitted to rendered depth before.
 
     Rendered depth is biased towards the camera wherever faint Gaussians float before a plain surface, the more so the
     more oblique the view. This may turn a plane by a degree or more.

@@ -107,7 +107,7 @@ def color_votes(
 
 
 def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray | None:
-    """Return float [H, W], the evidence of each pixel's color that the pixel is one of the object's.
+    """Return float [H, W], how much each pixel's color speaks for the object (> 0) or against it (< 0).
 
     It is the natural logarithm of a ratio: the frequency of the color among the object's pixels, divided by that among
     the pixels around the object.

@@ -49,8 +49,8 @@ SMOOTH_IF_REPEATING = 0.02  # the same for a plane whose texture repeats itself,
 def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the pixels of a view to paint.
 
-    These are the unknown pixels, the observed pixels of C in gaps between unknown pixels that are too narrow to be kept
-    (no disk of radius `MIN_KEPT_RADIUS` fits in), and the rim around both (`add_rim`).
+    These are the unknown pixels; the observed parts of C that are too narrow for a disk of radius `MIN_KEPT_RADIUS`;
+    and the rim around both (`add_rim`).
 
     Args:
         hidden: bool [H, W], C.
@@ -105,7 +105,7 @@ def complete_view(
 
 
 def _same_depth(depth: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], True where two depth maps show no two surfaces; `other` may be inf (unknown)."""
+    """Return bool [H, W], True where two depths may belong to one surface; False where `other` is inf."""
     return np.abs(depth - np.where(np.isfinite(other), other, 0.0)) < geometry.OTHER_SURFACE * depth
 
 
@@ -124,6 +124,7 @@ def _find_surfaces(
     target = SourceImage(image, hole, ~hole, plane, jacobians, depth / camera.fx, coordinates)
     others = [(view, around.photos[view.camera.name]) for view in _choose_others(own, around.views)]
     first = _source_image(own, around.photos[camera.name], around, with_reflections=True)
+    # The view's own photograph is also used beside the hole, however far the surface is from the object.
     beside = ndimage.distance_transform_edt(~hole) < np.sqrt(hole.sum())
     sources = [replace(first, usable=first.usable | beside & (own.depth > 0))]
     sources += [_source_image(*each, around) for each in (*others, *around.completed)]
@@ -163,14 +164,14 @@ def _surfaces_behind(
         possible = hidden | (at < (1 + geometry.OTHER_SURFACE) * surface)
         mine = each.pixels_on(cells, at, own.camera, pixels & possible) & (at < nearest)
         plane[mine], nearest[mine] = k, at[mine]
-    # A plane may cut through a round thing; there the mirror image of the thing wins.
+    # A mirror image wins if it is nearer, or about as near: a plane may cut through a round thing.
     image = mirrored.plausible_depth < (1 + geometry.OTHER_SURFACE) * nearest
     plane[image], nearest[image] = 0, mirrored.plausible_depth[image]
     return plane, np.where(np.isfinite(nearest), nearest, depth)
 
 
 def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return depth [H, W], interpolated across the hidden pixels."""
+    """Return depth [H, W], in which hidden pixels continue the surroundings; 1 everywhere if nothing is known."""
     if not known.any():
         return np.ones(depth.shape)
     across = inpaint_depth(depth, known)
@@ -204,7 +205,7 @@ def _source_image(
 
 
 def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
-    """Choose up to `OTHER_PHOTOS` other views, evenly spread from near to far."""
+    """Choose up to `OTHER_PHOTOS` other views, evenly spread in the order of their distance."""
     distance = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
     others = sorted((view for view in views if view is not own), key=distance)
     count = len(others)
@@ -215,7 +216,7 @@ def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView
 
 
 def _roughness(plane: Plane, around: Background) -> float:
-    """Return the median relative distance of the pixels near a plane from it; inf if no view shows enough of it."""
+    """Return the median over views of the median relative distance of pixels from a plane; inf if none shows enough."""
     medians = []
     for view in around.views[:: max(1, len(around.views) // 6)]:
         off = np.abs(view.depth / plane.depth(view.camera) - 1)

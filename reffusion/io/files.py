@@ -28,7 +28,7 @@ class BadInput(ValueError):
 
 @contextmanager
 def as_bad_input(path: Path, what: str) -> Iterator[None]:
-    """Turn every exception that is raised inside the context into BadInput.
+    """Turn every Exception that is raised inside the context into BadInput. A BadInput passes unchanged.
 
     All kinds of exceptions are caught, because libraries raise dozens of kinds for input that they do not understand.
 

@@ -19,7 +19,7 @@ from reffusion.references import agreement, changes, color, registration, view_r
 from reffusion.references.files import ReferenceFile
 from reffusion.references.registration import Registration
 from reffusion.references.undistort import undistort_reference, undistort_reference_depth
-from reffusion.shadows.reference_shadows import detect_shadows
+from reffusion.shadows.reference_shadows import detect_shadow
 from reffusion.types import Camera, MaskSet, Reference
 from reffusion.workspace import Workspace
 
@@ -109,7 +109,7 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
         image = color.recolor(image, found.gain, found.offset)
         usual = changes.redrawn_difference(image, photo, inside & ~hidden)
     margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
-    hole = hidden | detect_shadows(image, photo, hidden) & inside
+    hole = hidden | detect_shadow(image, photo, hidden) & inside
     image = color.paste(image, photo, hole, inside, margin, blend)
     if masks.invent.any() and (share := inside[masks.invent].mean()) < LEAST_HOLE_SHARE:
         raise ValueError(

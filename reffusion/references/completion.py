@@ -56,7 +56,7 @@ class Candidates:
         return cls(images, numbers[index], images[index], facts)
 
 
-def complete_view(params: Params, space: Workspace, folder: Path) -> tuple[Reference, Candidates]:
+def complete_best_view(params: Params, space: Workspace, folder: Path) -> tuple[Reference, Candidates]:
     """Inpaint the view that the stage `masks` selected as the best one.
 
     Outside the consistent mask C the reference is the photograph. In C it is a rendering of the remaining Gaussians

@@ -1,4 +1,4 @@
-"""The light of a shadow: how much brighter a picture is without it, and photographs in that light."""
+"""The light of a shadow: how much brighter a picture is without the shadow, and relit photographs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BLUR = 0.008  # of the image's width: standard deviation of the blur with which 
 DARK_OFFSET = 8  # of 255, added to both pictures, because the ratios of dark pixels are unreliable
 
 
-def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
+def measure_log_gain(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Return float32 [H, W, 3], the natural logarithm of the completed view's brightness divided by the photograph's.
 
     Each color channel has its own ratio. The pictures are blurred first.
@@ -25,13 +25,13 @@ def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
     return np.log(blur(reference) / blur(view))
 
 
-def relight(photo: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Return the photograph, uint8 [H, W, 3], with the shadow's brightness changed to that of the completed view.
+def relight(photo: np.ndarray, log_gain: np.ndarray) -> np.ndarray:
+    """Return the photograph, uint8 [H, W, 3], with its brightness multiplied by exp(`log_gain`).
 
     Args:
         photo: uint8 [H, W, 3].
-        light: [H, W, 3], log light as from `log_light`. Where it is NaN, the photograph stays the same.
+        log_gain: [H, W, 3], positive where the photograph becomes brighter. Where it is NaN, the photograph stays.
     """
-    known = np.isfinite(light)
-    lit = (photo.astype(np.float32) + DARK_OFFSET) * np.exp(np.where(known, light, 0)) - DARK_OFFSET
+    known = np.isfinite(log_gain)
+    lit = (photo.astype(np.float32) + DARK_OFFSET) * np.exp(np.where(known, log_gain, 0)) - DARK_OFFSET
     return np.where(known, np.round(lit).clip(0, 255), photo).astype(np.uint8)

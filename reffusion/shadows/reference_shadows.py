@@ -1,7 +1,7 @@
 """The object's cast shadows, which the masks do not cover, found by comparison with references.
 
 A reference is a view completed without the object. Where the object casts a shadow, reference and photograph differ
-beside the object. The shadow is projected into the other views, whose photographs are relit.
+beside the object. The shadow is projected into all views, and their photographs are relit.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from reffusion import geometry, morphology
 from reffusion.background.model import Background
 from reffusion.background.visibility import DepthView, with_photographed_depth
 from reffusion.prior import inpaint
-from reffusion.shadows.light import BLUR, DARK_OFFSET, log_light, relight
+from reffusion.shadows.light import BLUR, DARK_OFFSET, measure_log_gain, relight
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
 MIN_DENSITY = 0.05  # number of projected points per pixel below which the light of a pixel is unknown
 LOG_RATIO = 0.08  # absolute logarithm of the brightness ratio above which a pixel is in a shadow
-NEAR_MASK = 0.02  # of the image's width: distance from the mask that a shadow must reach
-MIN_AREA = 0.02  # of the mask's area: area beside the mask that must differ
+NEAR_MASK = 0.02  # of the image's width: largest gap between the mask and its shadow
+MIN_AREA = 0.02  # of the mask's area: area that must differ farther from the mask than NEAR_MASK
 PENUMBRA = 0.012  # of the image's width: dilation of a detected shadow, to include its soft rim
-NOISE_FACTOR = 4.0  # a pixel of a redrawn picture is in a shadow if its log-ratio is this many times the usual one
+NOISE_FACTOR = 4.0  # if a reference is redrawn everywhere, a shadow's log-ratio is this many times the usual one
 
 
 def remove_shadows(
@@ -43,8 +43,6 @@ def remove_shadows(
         background: the photographs and where they show the object.
 
     Returns:
-        A tuple of three results:
-
         - the references, each with the shadow that was detected in its own view added to its mask;
         - the background. Its photographs have the references' light where they showed the shadow. Pixels whose light
           is unknown are added to the masks of its views, and so do not supervise;
@@ -57,16 +55,16 @@ def remove_shadows(
         name = each.camera.name
         mask = background.masks[name]
         view = inpaint.composite_background(gaussians, each.camera, photos[name], mask)
-        shadow = detect_shadows(each.image, view, mask)
+        shadow = detect_shadow(each.image, view, mask)
         if (each.mask & ~mask).any():  # an inserted object and its rim differ too, but are no shadow
             shadow &= mask
         extended.append(replace(each, mask=each.mask | shadow))
         if not shadow.any():
             continue
-        print(f"reference {name}: beside the hole {shadow.sum()} px differ from what is seen, a shadow perhaps")
+        print(f"reference {name}: {shadow.sum()} px differ from what is seen, a shadow perhaps")
         depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
         depth = with_photographed_depth(depth, each.camera, background.views)
-        light = log_light(each.image, view)
+        light = measure_log_gain(each.image, view)
         projected = project_shadow(shadow, light, depth, each.camera, background.views)
         for other, (pixels, own_light) in projected.items():
             photos[other] = relight(photos[other], own_light)
@@ -78,7 +76,7 @@ def remove_shadows(
     return extended, replace(background, views=views, photos=photos), found
 
 
-def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def detect_shadow(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Find the object's shadow in a view: pixels that are darker or brighter than in the completed view.
 
     A shadow is connected to the mask, up to a small gap. If too few pixels beside the mask differ, there is no shadow.
@@ -109,11 +107,11 @@ def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) ->
 def project_shadow(
     shadow: np.ndarray, light: np.ndarray, depth: np.ndarray, camera: Camera, views: Sequence[DepthView]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Project the shadow that was detected in one view, and its log light (see `log_light`), into other views.
+    """Project the shadow that was detected in one view, and its log light (see `measure_log_gain`), into given views.
 
     Args:
         shadow: bool [H, W], the shadow in the view `camera`.
-        light: [H, W, 3], the result of `log_light` for the view `camera`.
+        light: [H, W, 3], the result of `measure_log_gain` for the view `camera`.
         depth: [H, W], camera z of the surfaces in the view `camera`; 0 where unknown.
         camera: the view in which the shadow was detected.
         views: the views into which the shadow is projected. The view `camera` may be among them.

@@ -25,7 +25,7 @@ from reffusion.shadows.soft_shadow import SoftShadow
 
 CELLS, CELL = 64, 1 / 8  # side of the map in cells; side of a cell in radii of the object
 FINE = 4  # parts into which the side of a cell is divided; the brightness of a cell is the median of its parts
-MAX_VIEWS, MAX_WIDTH = 24, 640  # number of views whose pixels are used, and columns of them at most
+MAX_VIEWS, MAX_WIDTH = 24, 640  # views whose pixels are used, at most; wider views are thinned to 640 to 1279 columns
 MIN_VIEWS = 2  # number of views that must show a cell
 MIN_PARTS = 1 / 3  # share of a cell's parts that must be seen
 NEAR, MIN_NEAR = 0.3, 0.03  # radii; a plane is a candidate if this share of the object's Gaussians is so near
@@ -44,7 +44,7 @@ ITERATIONS = 30  # of the reweighting
 
 DARK = 0.08  # log light below which a cell is dark
 MIN_DEPTH, MIN_VOLUME = 0.4, 0.8  # log light of the darkest cell; sum of log light over cells, times squared radii
-CORE, MAX_CORE_DISTANCE = 0.7, 0.25  # cells this share of the darkest one; their distance in radii from hidden cells
+CORE, MAX_CORE_DISTANCE = 0.7, 0.25  # cells at least this share as dark as the darkest; their radii from hidden cells
 MAX_TINT = 0.35  # spread of the channels' log light, relative to their mean
 MAX_HIDDEN = 1.2  # radii from the object's middle: unseen cells up to there are hidden by the object
 MIN_LIT = 0.4  # share of the cells around the shadow that are seen, and thus lit
@@ -60,12 +60,13 @@ def find_soft_shadow(background: Background, object_means: Tensor) -> SoftShadow
         object_means: [N, 3], the centers of the object's Gaussians.
 
     Returns:
-        The shadow with the largest sum of log light; None if there is none, or fewer than `MIN_VIEWS` photographs.
+        The shadow whose log light sums to the lowest value. None if there is none, or if there are fewer than
+        `MIN_VIEWS` photographs.
     """
     if len(background.photos) < MIN_VIEWS:
         return None
     means = object_means.detach().double().cpu().numpy()
-    best, best_volume = None, MIN_VOLUME
+    best, best_volume = None, 0.0
     for index, plane in enumerate(background.planes, start=1):
         heights = np.abs(means @ plane.normal - plane.offset) / background.radius
         if (heights < NEAR).mean() < MIN_NEAR:
@@ -90,7 +91,7 @@ def _cell_brightness(background: Background, index: int) -> np.ndarray:
         chosen[np.arange(chosen.shape[0]) % every != 0] = False
         chosen[:, np.arange(chosen.shape[1]) % every != 0] = False
         points = geometry.unproject(view.depth, view.camera)[chosen]
-        cells = _map_index(points, background, plane) * FINE
+        cells = _map_coordinates(points, background, plane) * FINE
         inside = ((cells >= 0) & (cells < side)).all(1)
         row, column = cells[inside].astype(np.int64).T
         colors = np.log(background.photos[view.camera.name][chosen][inside].astype(np.float32) + DARK_OFFSET)
@@ -111,7 +112,7 @@ def _cell_brightness(background: Background, index: int) -> np.ndarray:
     return np.where(seen[..., None], brightness, np.nan)
 
 
-def _map_index(points: np.ndarray, background: Background, plane: Plane) -> np.ndarray:
+def _map_coordinates(points: np.ndarray, background: Background, plane: Plane) -> np.ndarray:
     """Return [P, 2], the coordinates of world points [P, 3] on the map of a plane, in cells; cell 0 is [0, 1)."""
     return (points - background.center) @ plane.axes.T / (CELL * background.radius) + CELLS / 2
 
@@ -140,6 +141,7 @@ def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, cl
         # The weights w are small where dL and dB differ by more than `clip` standard deviations of dB, as at the border
         # of two materials; they are those of the mean channel.
         weights = (1 + (misfit / (clip * deviation)) ** 2) ** -2.0
+    # The solver has the weights of the last round but one, which differ little from these.
     light[seen] = solver.solve(first.T @ (weights[:, None] * steps))
     return light
 
@@ -179,7 +181,7 @@ def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
 def _make_shadow(
     background: Background, plane: Plane, brightness: np.ndarray, seen: np.ndarray, region: np.ndarray
 ) -> SoftShadow:
-    """Return the shadow of the given region: the soft light there, and the colors of the region."""
+    """Return the shadow around `region`: the soft light of all dark cells connected to it, and its tint."""
     soft = _smooth_light(brightness, seen, *SOFT)
     tint = soft[region].mean(0)
     mean = GAIN * np.minimum(soft.mean(2), 0)

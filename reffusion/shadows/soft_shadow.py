@@ -25,7 +25,7 @@ class SoftShadow:
         center: [3], the point of the plane below the middle of the map.
         axes: [2, 3], unit vectors of the map's rows and columns.
         cell_size: side of a cell, in world units.
-        fade: [2] heights over the plane in world units; up to the first the shadow is complete, from the second none.
+        fade: [2] distances from the plane in world units; up to the first the shadow is complete, from the second none.
         log_light: [K, K], the map: logarithm of the brightness relative to that without the shadow, at most 0.
         tint: [3], the log light of each color channel divided by `log_light`.
     """

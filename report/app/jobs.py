@@ -1,4 +1,4 @@
-"""The runner as a process of its own: plans, start, stop, and the progress of a job whoever started it.
+"""Runs the runner in processes of its own: plans scenes, starts and stops jobs, and reads the progress of any job.
 
 A job that the page starts goes on when the page or its server ends, and a job that a terminal started is shown. The
 files are runs/.app/<scene>.json (process and target), <scene>.log (what the runner prints) and <scene>.profile (the
@@ -26,7 +26,7 @@ from runner.plan import FINAL
 
 RECORDS = ".app"  # folder in runs/
 QUALITIES = ("laptop", "fine")  # profiles between which the page lets users choose
-TAIL_BYTES, TAIL_LINES = 20_000, 40
+TAIL_BYTES, TAIL_LINES = 20_000, 40  # of a log: bytes that are read, lines that are shown
 WITHOUT_MASKS = "poses.clicks={}"  # announces masks by clicks, so that stages accept a scene without masks
 
 
@@ -40,8 +40,8 @@ def make_environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(root()), os.environ.get("PYTHONPATH", "")]))}
 
 
-def describe_loss(scene: OpenScene) -> str:
-    """Return a sentence on a scene whose photographs were moved away, and on what would bring them back."""
+def describe_missing_source(scene: OpenScene) -> str:
+    """Return a sentence on a scene whose photographs were moved away."""
     return (
         f"The photographs are no longer at {scene.source}. Move them back to run stages again; finished results stay."
     )
@@ -54,7 +54,7 @@ class Plan:
     Attributes:
         stages: stage -> entry of plan.json.
         lacks_masks: True if the scene needs masks before the whole job can run.
-        error: why there is no plan; "" if there is one.
+        error: why there is no plan, or what the planned job lacks; "" if neither is the case.
         is_lost: True if the scene's folder or video was not there.
         busy: True while it is being computed.
     """
@@ -79,7 +79,7 @@ class Jobs:
         self.plans: dict[str, Plan] = {}
         self.started: dict[str, subprocess.Popen] = {}
         self.shown: dict[str, ShownProgress] = {}
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()  # `start` holds it, and may come to `renew_plan`
 
     # ------------------------------------------------------------------------------------------------ plans
 
@@ -105,7 +105,11 @@ class Jobs:
     def _compute_plan(self, scene: OpenScene, plan: Plan) -> None:
         plan.is_lost = not scene.source.exists()
         if plan.is_lost:
-            plan.lacks_masks, plan.error, plan.stages = False, describe_loss(scene), self._read_finished(scene)
+            plan.lacks_masks, plan.error, plan.stages = (
+                False,
+                describe_missing_source(scene),
+                self._read_last_plan(scene),
+            )
             plan.busy = False
             return
         try:
@@ -116,10 +120,8 @@ class Jobs:
                     again = self._read_plan(scene)
                     lacks_masks = again["poses"]["word"] != "missing"
                     stages = again if lacks_masks else stages
-            plan.lacks_masks, plan.error, plan.stages = lacks_masks, error, stages
             wrong = [entry["reason"] for entry in stages.values() if entry["word"] == "missing"]
-            if not error and wrong:
-                plan.error = wrong[0]
+            plan.lacks_masks, plan.error, plan.stages = lacks_masks, error or next(iter(wrong), ""), stages
         finally:
             plan.busy = False
 
@@ -135,7 +137,7 @@ class Jobs:
         return load_json(path)["stages"] if path.is_file() else {}
 
     def quality(self, scene: OpenScene) -> str:
-        """Return the profile of the last plan if the user may choose between `QUALITIES`, else ""."""
+        """Return the profile of the last plan; "" if it is none of `QUALITIES`, or if --profile fixes it."""
         path = scene.home / "plan.json"
         profile = load_json(path)["profile"] if path.is_file() and "--profile" not in self.options else ""
         return profile if profile in QUALITIES else ""
@@ -154,8 +156,8 @@ class Jobs:
         save_text(self._profile_file(scene), profile)
         self.renew_plan(scene)
 
-    def _read_finished(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
-        """Return the last plan; stages that were done since then are done in it, too."""
+    def _read_last_plan(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
+        """Return the last plan, in which stages that were finished since then count as cached."""
         record = scene.home / "plan.json"
         stages = self._read_plan(scene)
         for stage, entry in stages.items():
@@ -179,12 +181,12 @@ class Jobs:
             with_clicks: True if the scene has no masks yet, and gets them by clicks.
 
         Raises:
-            ValueError: somebody else's runner holds the scene.
+            ValueError: a job of the scene runs, started by the page or by somebody else.
         """
         with self.lock:
             state = self.state(scene)
             if state["state"] in ("running", "elsewhere"):
-                raise ValueError(state["words"])
+                raise ValueError(state["words"] or "a job runs; stop it first")
             more = ("--set", WITHOUT_MASKS) if with_clicks else ()
             log = self._log(scene)
             log.parent.mkdir(parents=True, exist_ok=True)
@@ -198,7 +200,7 @@ class Jobs:
                     start_new_session=True,  # it goes on when the server ends
                 )
             self.started[scene.name] = process
-            save_json(self._record(scene), {"process": process.pid, "target": target, "since": time.time()})
+            save_json(self._record(scene), {"process": process.pid, "target": target})
         threading.Thread(target=self._await, args=(scene, process), daemon=True).start()
 
     def _await(self, scene: OpenScene, process: subprocess.Popen) -> None:
@@ -229,7 +231,7 @@ class Jobs:
         return list(running)
 
     def is_finished(self, scene: OpenScene, target: str) -> bool:
-        """Return whether the last job of the page was for this target and succeeded."""
+        """Return whether the last job that this server started for the scene succeeded and included this target."""
         process, record = self.started.get(scene.name), self._read_record(scene)
         return process is not None and process.poll() == 0 and record.get("target") in (target, "all")
 
@@ -242,7 +244,7 @@ class Jobs:
             "share" done in [0, 1]; "left": expected seconds to the end of the job; "whole": share of the whole job that
             is done; "done": stages that this job has done; "log": last lines of the output.
         """
-        record, holder, process = self._read_record(scene), lock_holder(self.runs, scene.name), None
+        record, holder = self._read_record(scene), lock_holder(self.runs, scene.name)
         process = self.started.get(scene.name)
         alive = process is not None and process.poll() is None
         mine = alive or (holder is not None and holder == (str(record.get("process")), MACHINE))

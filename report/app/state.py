@@ -15,13 +15,13 @@ from reffusion.weights.published import SEGMENTER_FILES
 from reffusion.weights.segmenters import AUTO, segmenter_folder
 from report import verdict
 from report.app import painting, tasks
-from report.app.jobs import Jobs, describe_loss
+from report.app.jobs import Jobs, describe_missing_source
 from report.app.scenes import OpenScene
 from report.job_data import JobFiles, load_job
 from report.sheet import stage_folder
 from runner.plan import FINAL
 
-LAYOUTS = {
+LAYOUT_LABELS = {
     "llff": "LLFF",
     "transforms": "nerfstudio (transforms.json)",
     "colmap": "COLMAP",
@@ -55,7 +55,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "has_unsaved_marks": scene.mask_step is not None and scene.mask_step.session.unsaved,
         "awaits_fit": scene.mask_step is not None and scene.mask_step.session.gaussians is None,
         "has_network": has_network(scene),
-        "lost": "" if scene.source.exists() else describe_loss(scene),
+        "lost": "" if scene.source.exists() else describe_missing_source(scene),
         "has_poses": (scene.home / "raw_masks" / "receipt.json").is_file(),
         "plan": {
             "busy": plan.busy,
@@ -81,7 +81,7 @@ def describe_capture(scene: OpenScene, stages: dict[str, dict[str, Any]]) -> lis
     """Return what is known about the capture, a phrase each: layout, the plan's notes, poses, masks, test views."""
     words = []
     if scene.folder.is_dir():
-        words.append(f"layout: {LAYOUTS[detect_layout(scene.folder)]}")
+        words.append(f"layout: {LAYOUT_LABELS[detect_layout(scene.folder)]}")
     frames, sfm = scene.home / "frames" / "frames.json", scene.home / "poses" / "sfm.json"
     words += [load_json(frames)["said"]] if frames.is_file() else []
     views = scene.views()

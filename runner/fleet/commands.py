@@ -1,4 +1,4 @@
-"""The commands beside `plan` and `run`: on many scenes, variants or machines, and on what earlier runs left."""
+"""The commands beside `plan` and `run`: many scenes, variants or machines, weights, and results of earlier runs."""
 
 import argparse
 from dataclasses import replace
@@ -13,11 +13,11 @@ from runner.fleet.weights import fetch_weights
 from runner.resolve import Request
 from runner.text import display_path
 
-SOME_FAILED = 3  # exit code of `compare` if it finished and some runs failed
+SOME_FAILED = 3  # exit code of `compare` if it finished and some runs failed; `batch` exits with 1
 
 
 def choose_engine(request: Request, arguments: argparse.Namespace) -> tuple[Request, Execution]:
-    """Return the request and the execution on the engine that the arguments name."""
+    """Return the request and the settings of the execution for the engine that the arguments name."""
     engine = make_engine(arguments.engine, arguments.address, request.root, request.runs)
     return replace(request, cuda=engine.cuda), Execution(engine, arguments.cores, memory_mb=expected_memory_mb)
 
