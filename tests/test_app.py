@@ -29,6 +29,7 @@ from report.access import REFUSAL, Access
 from report.app import brush, painting, pictures, scenes, uploads
 from report.app.app import App
 from report.app.job_progress import ShownProgress, estimate_remaining
+from report.app.jobs import Jobs
 from report.app.scenes import OpenScene
 from report.app.server import Server
 from report.job_data import load_job
@@ -345,6 +346,8 @@ def test_a_run_in_a_terminal_is_shown_and_left_alone(page, scene, tmp_path):
         for action in ("start", "stop"):
             status, answer = page.post(f"/scenes/scene/do/{action}")
             assert status == 400 and "a terminal run" in answer["error"]
+        with pytest.raises(ValueError, match="a terminal run"):  # a page that has made no plan yet
+            Jobs(tmp_path / "runs").start(OpenScene("scene", scene, tmp_path / "runs/scene"), "all")
         assert holder.poll() is None
     finally:
         holder.kill()
