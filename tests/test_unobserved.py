@@ -242,7 +242,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     points = geometry.unproject(render_table(other.camera)[0], other.camera)
     same = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, own_light = reference_shadows.project_shadow(
-        found, light.log_light(truth, photo), depth, view.camera, [other]
+        found, light.measure_log_gain(truth, photo), depth, view.camera, [other]
     )["a1"]
     assert carried[same].mean() > 0.9 and not carried[~render_table(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
