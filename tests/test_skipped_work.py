@@ -68,7 +68,7 @@ def test_only_the_profile_laptop_leaves_sds_out():
     """Personalization follows: a prior that no term asks need not be there."""
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
-    assert runs == dict.fromkeys(runs) | {"laptop": "never", "laptop-terms": "always"}
+    assert runs == dict.fromkeys(runs) | {"laptop": "never", "fine": "never", "laptop-terms": "always"}
     nothing = with_changes(Params(), sds={"run": "never"}, depth={"weight": 0})
     assert plan_distill.needed_weights(nothing, frozenset()) == []
     assert plan_distill.needed_weights(with_changes(nothing, sds={"run": "always"}), frozenset()) != []

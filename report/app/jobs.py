@@ -139,7 +139,7 @@ class Jobs:
     def quality(self, scene: OpenScene) -> str:
         """Return the profile of the last plan; "" if it is none of `QUALITIES`, or if --profile fixes it."""
         path = scene.home / "plan.json"
-        profile = load_json(path)["profile"] if path.is_file() and "--profile" not in self.options else ""
+        profile = load_json(path).get("profile") if path.is_file() and "--profile" not in self.options else ""
         return profile if profile in QUALITIES else ""
 
     def choose_quality(self, scene: OpenScene, profile: str) -> None:
