@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from reffusion.io.images import load_image
 from report import doctor
 
 ROOT = Path(__file__).resolve().parent.parent
+SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes beside other tests; REFFUSION_SLOW=1")
 
 
 def test_faults_are_named_and_a_right_picture_has_none():
@@ -33,7 +35,7 @@ def test_faults_are_named_and_a_right_picture_has_none():
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("key", ["exemplar", "embedded"])
+@pytest.mark.parametrize("key", ["exemplar", pytest.param("embedded", marks=SLOW)])
 def test_what_a_fresh_machine_has_is_plausible(key):
     case = doctor.make_case()
     assert doctor.find_problem(key) is None
