@@ -15,7 +15,7 @@ from reffusion.io.images import load_image
 from report import doctor
 
 ROOT = Path(__file__).resolve().parent.parent
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes beside other tests; REFFUSION_SLOW=1")
+SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes; set REFFUSION_SLOW=1")
 
 
 def test_faults_are_named_and_a_right_picture_has_none():
