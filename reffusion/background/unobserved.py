@@ -148,9 +148,8 @@ def _continues_surroundings(
         return False
     # A plane that merely cuts through a solid thing does not agree with the depth beside the patch.
     nearest, farthest = depth_range(depth)
-    agrees = (plane_depth > nearest * (1 - geometry.SAME_SURFACE)) & (
-        plane_depth < farthest * (1 + geometry.SAME_SURFACE)
-    )
+    agrees = plane_depth > nearest * (1 - geometry.SAME_SURFACE)
+    agrees &= plane_depth < farthest * (1 + geometry.SAME_SURFACE)
     agrees &= np.abs(plane_depth - depth) < DEPTH_EDGE * depth
     # The depth of one view may be wrong on rough ground and in reflections. There the other views decide.
     agrees |= plane.pixels_on(plane.seen, plane_depth, camera, ring)

@@ -314,9 +314,8 @@ def _refuted_share(view: ViewDepth, disparity: np.ndarray) -> float:
     # The surface would hide a plane that continues there, or other views see past the surface. For example, the planes
     # of a post and of the ground behind the post intersect in front of ground that other views see, so these planes are
     # rejected.
-    refuted = (view.anchored & (disparity > view.disparity * (1 + geometry.OTHER_SURFACE))) | _in_free_space(
-        view, disparity
-    )
+    hides_plane = view.anchored & (disparity > view.disparity * (1 + geometry.OTHER_SURFACE))
+    refuted = hides_plane | _in_free_space(view, disparity)
     return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
 
 
