@@ -40,7 +40,7 @@
 ## make prior-report              measure the embedded prior (minutes): runs/prior-report
 ## make setup | test | lint       .venv; the tests, with slow=1 the slow ones too (make fuzz: hours); ruff and mypy
 ## make docs                      the documents as a site: build/site
-## make test-fast                 the tests that start no processes and train nothing (two minutes)
+## make test-fast                 the tests that start no processes and train nothing (five minutes)
 ## make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines
 ## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
 ##
