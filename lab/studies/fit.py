@@ -68,11 +68,11 @@ def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]
     Raises:
         ValueError: `out` has a fit with other parameters.
     """
-    saved = out / "params.json"
-    if saved.exists() and json.loads(saved.read_text()) != params.model_dump():
+    saved, text = out / "params.json", params.model_dump_json()
+    if saved.exists() and json.loads(saved.read_text()) != json.loads(text):
         raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
     out.mkdir(parents=True, exist_ok=True)
-    saved.write_text(json.dumps(params.model_dump()))
+    saved.write_text(text)
     if not (out / "gaussians.ply").exists():
         fit.run(params, out, poses=poses)
     return trace.read_trace(out / "trace.jsonl")

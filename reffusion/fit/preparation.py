@@ -14,6 +14,7 @@ from reffusion.fit import few_views
 from reffusion.fit.exposure import BRIGHTNESS_DEVIATION
 from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.fit.start import initial_gaussians
+from reffusion.fit.unmatched import place_unmatched
 from reffusion.io.images import to_uint8
 from reffusion.masks import voting
 from reffusion.params.fit import Params
@@ -115,9 +116,10 @@ def collect_points(
     images: dict[str, np.ndarray],
     hidden: Mapping[str, np.ndarray] = MappingProxyType({}),
 ):
-    """Collect the points from which a fit starts: the sparse points, and points triangulated from optical flow.
+    """Collect the points from which a fit starts: the sparse points, and points where pictures show more.
 
-    Points from flow are added if `params.init.flow_cell` is not 0. A point is left out if it projects into `hidden` in
+    If `params.init.flow_cell` is not 0, points are triangulated from optical flow, and added where a view shows no
+    point (`place_unmatched`). A point is left out if it projects into `hidden` in
     more than half of those views that have such a mask and contain the point, because no supervising pixel would ever
     move Gaussians there.
 
@@ -134,6 +136,9 @@ def collect_points(
         flow_points, flow_colors = flow.triangulate_points(cameras, images, params.init.flow_cell)
         print(f"{len(flow_points)} points by optical flow beside {len(points)}", flush=True)
         points, colors = np.concatenate([points, flow_points]), np.concatenate([colors, flow_colors])
+        more, more_colors = place_unmatched(cameras, images, points)
+        print(f"{len(more)} points where a view shows none of them", flush=True)
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
     kept = ~voting.points_inside(points, cameras, hidden)
     return points[kept], colors[kept]
 

@@ -22,9 +22,13 @@ class SphericalHarmonics(Settings):
 
 
 class Init(Settings):
-    """Settings of the initial Gaussians, one at each sparse point and at each point added from optical flow."""
+    """Settings of the initial Gaussians, one at each sparse point and at each added point."""
 
-    flow_cell: int = Field(0, ge=0, description="cell size in px; adds a point from optical flow per cell; 0: none")
+    flow_cell: int = Field(
+        0,
+        ge=0,
+        description="cell size in px; adds a point from optical flow per cell, more where a view shows none; 0: none",
+    )
     opacity: float = Field(0.1, gt=0, lt=1, description="opacity of the initial Gaussians")
     scale: float = Field(1.0, gt=0, description="their standard deviation / distance to the nearest points (3DGS: 1)")
 

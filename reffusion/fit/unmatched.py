@@ -1,0 +1,90 @@
+"""Initial points where a view shows what no match between views places in space.
+
+Forest behind a trunk that one photograph shows, or the bark at its border, has no sparse point and no flow. A fit would
+have to grow Gaussians across such areas from their rims, and a short one leaves flat color or long needles there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from scipy.ndimage import distance_transform_edt, median_filter
+
+from reffusion.capture.flow import FARTHEST, unproject
+from reffusion.geometry import SAME_IF_COARSE
+from reffusion.types import Camera
+
+CELL = 6  # px: a point is added for each empty cell of this side
+REACH = 3  # cells: one that is nearer than this to a cell with a point needs no point of its own
+SMOOTHING = 5  # cells: side of the window in which the depth of cells with points is a median
+FARTHER = 1.5  # factor by which a point moves away while another view sees past it
+
+
+def place_unmatched(
+    cameras: Sequence[Camera], images: Mapping[str, np.ndarray], points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Add a point for each cell of a view that shows no point.
+
+    Its depth is that of the nearest cell that shows one, times powers of `FARTHER` until no other view sees past the
+    point; a point beyond `FARTHEST` is moved to this depth.
+
+    Args:
+        cameras: the views, in the normalised frame.
+        images: view name -> uint8 [H, W, 3].
+        points: [P, 3], the points that matches have placed.
+
+    Returns:
+        The added points [A, 3] float64 and their colors [A, 3] uint8.
+    """
+    seen = {camera.name: _depth_of_cells(camera, points) for camera in cameras}
+    added, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
+    for camera in cameras:
+        depth = np.minimum(seen[camera.name], _depth_of_cells(camera, added))
+        shown = np.isfinite(depth)
+        if not shown.any():
+            continue
+        away, nearest = distance_transform_edt(~shown, return_indices=True)
+        smooth = median_filter(depth[tuple(nearest)], SMOOTHING)
+        rows, columns = np.nonzero(away >= REACH)
+        pixels = np.stack([(columns + 0.5) * CELL, (rows + 0.5) * CELL], 1)
+        inside = (pixels < (camera.width, camera.height)).all(1)
+        pixels, depths = pixels[inside], smooth[tuple(nearest[:, rows[inside], columns[inside]])]
+        while (passed := (depths < FARTHEST) & _is_seen_past(unproject(camera, pixels, depths), cameras, seen)).any():
+            depths = np.where(passed, depths * FARTHER, depths)
+        added = np.concatenate([added, unproject(camera, pixels, np.minimum(depths, FARTHEST))])
+        columns, rows = pixels.astype(int).T
+        colors.append(cv2.blur(images[camera.name], (CELL, CELL))[rows, columns])
+    return added, np.concatenate(colors)
+
+
+def _is_seen_past(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return bool [P], True for points before what a view shows in their cell, by its depth of cells in `seen`."""
+    past = np.zeros(len(points), bool)
+    for camera in cameras:
+        cells, depth = _locate(camera, points)
+        inside = np.flatnonzero(cells >= 0)
+        behind = seen[camera.name].reshape(-1)[cells[inside]]
+        past[inside] |= np.isfinite(behind) & (depth[inside] < behind * (1 - SAME_IF_COARSE))
+    return past
+
+
+def _depth_of_cells(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the least depth of the points in each cell of a view, infinite where there is none."""
+    high, wide = -(-camera.height // CELL), -(-camera.width // CELL)
+    cells, depth = _locate(camera, points)
+    least = np.full(high * wide, np.inf)
+    np.minimum.at(least, cells[cells >= 0], depth[cells >= 0])
+    return least.reshape(high, wide)
+
+
+def _locate(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the cell in which a view shows each point, -1 if in none, and the points' depths."""
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = local[:, 2]
+    front = np.maximum(depth, 1e-3)
+    x, y = local[:, 0] / front * camera.fx + camera.cx, local[:, 1] / front * camera.fy + camera.cy
+    inside = (depth > 1e-3) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    column, row = (np.where(inside, each, 0).astype(int) // CELL for each in (x, y))
+    return np.where(inside, row * -(-camera.width // CELL) + column, -1), depth
