@@ -10,14 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.views import load_placed_views
+from reffusion.clicks.sam_onnx import load_distilled_sam
 from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.scene import save_references, save_teaching
 from reffusion.params.reference import Params
 from reffusion.references import view_ranking
+from reffusion.references.added_things import find_added_thing
 from reffusion.references.adoption import adopt_references
 from reffusion.references.completion import Candidates, complete_best_view
 from reffusion.references.files import list_teaching_files, load_reference_files
+from reffusion.types import Reference
+from reffusion.weights.local import segmenter_cache
 from reffusion.workspace import Workspace
 
 CANDIDATES = "candidates.png"
@@ -53,6 +57,9 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
         save_views_to_paint(out / TO_PAINT, [each.view for each in files], space)
     if not files:
         print(describe_choice(reference.camera.name, candidates), flush=True)
+        is_patched = "misfits" in candidates.facts  # from photographs, which add nothing new
+        if not is_patched and (warning := describe_added_thing(reference)):
+            print(warning, flush=True)
 
 
 def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> None:
@@ -91,6 +98,27 @@ def describe_choice(view: str, candidates: Candidates) -> str:
     return (
         f"{where}, {len(candidates.images)} candidates from left to right; number {candidates.chosen} (counted from 0) "
         'is taken, set="reference.choose=NUMBER" takes another'
+    )
+
+
+def describe_added_thing(reference: Reference) -> str | None:
+    """Return a warning if the painted hole of a reference shows a thing of its own; None if not, or without a network.
+
+    The network is the distilled SAM of the click page.
+    """
+    try:
+        segmenter = load_distilled_sam(segmenter_cache())
+    except ValueError as error:
+        return f"warning: the painting was not searched for added things: {error}"
+    if segmenter is None:
+        return None
+    thing = find_added_thing(segmenter, reference.image, reference.mask)
+    if not thing.any():
+        return None
+    share = np.count_nonzero(thing & reference.mask) / np.count_nonzero(reference.mask)
+    return (
+        f"warning: the painting seems to add a thing to the hole of view {reference.camera.name} ({share:.0%} of the "
+        "hole); look at it, and take another candidate or prompt if it does not belong there"
     )
 
 

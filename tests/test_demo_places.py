@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import yaml
 from reffusion.io.images import load_mask
 
 pytestmark = pytest.mark.integration
+SEEDS = (0, 11) if os.environ.get("REFFUSION_SLOW") == "1" else (0,)
 
 
 @pytest.mark.parametrize(
@@ -18,7 +20,7 @@ pytestmark = pytest.mark.integration
     [("behind", 0.06, 0.6), ("beside", 0.04, 0.1), ("table", 0.05, 0.05), ("corner", 0.1, 0.4), ("grass", 0.1, 0.5)],
 )
 def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, mask, share):
-    for seed in (0, 11):
+    for seed in SEEDS:
         facts = generate.generate(tmp_path / f"{name}{seed}", seed, shrink_kind(generate.KINDS[name]))
         assert share <= min(facts["never_seen_share"].values()) < 0.9
         assert mask < facts["mask_share"]["train"] < 0.25
@@ -43,7 +45,7 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
     from lab.scenes import photographs, raycast
 
     kind = shrink_kind(generate.KINDS["behind"])
-    for seed in (0, 1, 2):
+    for seed in SEEDS:
         solids, cameras, session = photograph_scene(generate, kind, seed)
         without = solids._replace(**{f: v[~solids.removable] for f, v in solids._asdict().items()})
         unseen = [
@@ -64,7 +66,7 @@ def test_the_object_hides_a_part_of_a_thing_close_to_it_in_the_reference_view(ge
     from lab.scenes.solids import ROOM
 
     kind = shrink_kind(generate.KINDS["beside"])
-    for seed in (0, 1):
+    for seed in SEEDS:
         solids, cameras, session = photograph_scene(generate, kind, seed)
         chest = np.flatnonzero(solids.removable)[0]
         from_chest = np.linalg.norm(solids.center[:, ::2] - solids.center[chest, ::2], axis=1)

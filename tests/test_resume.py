@@ -1,6 +1,6 @@
 """Resume of a small scene, end to end: the runner is killed at random moments, and the result is that of a whole run.
 
-RESUME_KILLS sets the number of kills: 3 by default to save time, 20 before a release.
+RESUME_KILLS sets the number of kills: 1 by default to save time, 20 before a release.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from runner.resolve import Request, resolve
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).resolve().parent.parent
-KILLS = int(os.environ.get("RESUME_KILLS", "3"))
+KILLS = int(os.environ.get("RESUME_KILLS", "1"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")
 # The order in which stages are killed. Stages with checkpoints come first.
 IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
@@ -84,10 +84,10 @@ def test_killed_at_random_moments(mini_scene, unbroken_run, tmp_path):
     random = np.random.default_rng(0)
     killed = 0
     for stage in sorted((IN_TURN[i % len(IN_TURN)] for i in range(KILLS)), key=STAGES.index):
-        killed += kill_during(mini_scene, tmp_path / "broken", stage, random.uniform(0, seconds[stage]))
+        killed += kill_during(mini_scene, tmp_path / "broken", stage, random.uniform(0, 0.7) * seconds[stage])
         assert_outputs_match_receipts(tmp_path / "broken/mini")
     assert run_to_end(mini_scene, tmp_path / "broken") == metrics
-    assert killed >= KILLS // 2  # the other kills came after the end of their stage
+    assert killed >= (KILLS + 1) // 2  # the other kills came after the end of their stage
     assert not list((tmp_path / "broken/mini").glob(".partial*"))
 
 

@@ -58,6 +58,7 @@ from reffusion.params.base import Prompts, Settings
 from reffusion.prior import diffusion, lora
 from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
+from report.paired_statistics import confidence_half_width
 from stages import personalize as stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +68,7 @@ TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # number of unseen views
 SHOWN = 12  # held-out pictures on the sheet
-PHOTOGRAPH_CASES = 36  # pictures of each kind from held-out photographs
+PHOTOGRAPH_CASES = 200  # pictures of each kind from held-out photographs
 PROMPTS = {"reference": Prompts().whole, "whole": Prompts().whole, "window": Prompts().crop}
 LEARNS = ("poses", "raw_masks", "reference")  # stages that personalization needs of a run
 
@@ -79,13 +80,19 @@ def score_cases(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, floa
     return mean_scores([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
+def score_fillings(case: Case, *pictures: np.ndarray) -> dict[str, float]:
+    """Return the scores of fillings of one picture, see `hole_scores`, averaged over the fillings."""
+    rows = [hole_scores(picture, case.truth, case.hole) for picture in pictures]
+    return {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
+
+
 def time_cpu(work) -> tuple:
     """Call `work`; return its result and the CPU seconds of this process, summed over all its threads."""
     began = time.process_time()
     return work(), time.process_time() - began
 
 
-def measure_inpainting(priors: list[str], cases: list[Case], start: float, out: Path) -> dict:
+def measure_inpainting(priors: list[str], cases: list[Case], start: float, noises: int, out: Path) -> dict:
     """Fill held-out pictures by OpenCV's methods and by priors, and score them.
 
     The first `SHOWN` cases are saved as rows of pictures.
@@ -94,27 +101,38 @@ def measure_inpainting(priors: list[str], cases: list[Case], start: float, out: 
         priors: diffusers folders.
         cases: pictures with holes.
         start: see `fill_holes`.
+        noises: seeds of the sampler's noise, over which a picture's scores are averaged.
         out: folder for the rows of pictures.
 
     Returns:
-        "columns": titles of the columns of pictures; "scores": method -> kind of picture ("all" too) -> mean scores.
-        The kind "all" also has "seconds" of CPU per picture.
+        "columns": titles of the columns of pictures; "scores": method -> kind of picture ("all" too) -> mean scores,
+        and "lpips_over_telea", the mean of LPIPS minus Telea's and half its 95 % interval over the pictures. The kind
+        "all" also has "seconds" of CPU per picture.
     """
     rivals = {"Telea": cv2.INPAINT_TELEA, "Navier-Stokes": cv2.INPAINT_NS}
     ways, seconds = {}, {}
     for name, flag in rivals.items():
         fill = lambda flag=flag: [cv2.inpaint(c.truth, c.hole.astype(np.uint8), TELEA_RADIUS, flag) for c in cases]
-        ways[name], seconds[name] = time_cpu(fill)
+        filled, seconds[name] = time_cpu(fill)
+        ways[name] = [filled]
     for name in priors:
         prior = load_prior(name)
-        ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED, start=start))
+        fill = lambda prior=prior: [fill_holes(prior, cases, SEED + k, start=start) for k in range(noises)]
+        ways[name], spent = time_cpu(fill)
+        seconds[name] = spent / noises
     for index, case in enumerate(cases[:SHOWN]):
-        save_row(out / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
+        save_row(out / f"{index:02d}.png", case, [fillings[0][index] for fillings in ways.values()])
+    rows = {
+        name: [score_fillings(*each) for each in zip(cases, *fillings, strict=True)] for name, fillings in ways.items()
+    }
     result = {}
-    for name, pictures in ways.items():
-        rows = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
-        kinds = ["all", *sorted({kind for kind, _ in rows})]
-        result[name] = {kind: mean_scores([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
+    for name, own in rows.items():
+        result[name] = {}
+        for kind in ("all", *sorted({case.kind for case in cases})):
+            chosen = [k for k, case in enumerate(cases) if kind in ("all", case.kind)]
+            over = np.array([own[k]["lpips"] - rows["Telea"][k]["lpips"] for k in chosen])
+            telea = {"lpips_over_telea": [float(over.mean()), confidence_half_width(over)]}
+            result[name][kind] = mean_scores([own[k] for k in chosen]) | telea
         result[name]["all"]["seconds"] = seconds[name] / len(cases)
     return {"columns": ["hole", *ways, "truth"], "scores": result}
 
@@ -397,6 +415,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0 skips this part")
     parser.add_argument("--photographs", type=Path, help="the output of `lab.prior.photographs`")
     parser.add_argument("--start", type=float, default=1.0, help="noise level from which filled holes are painted")
+    parser.add_argument("--noises", type=int, default=1, help="seeds of the sampler's noise to average over")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of personalization")
@@ -423,7 +442,7 @@ def main() -> None:
     if arguments.pictures:
         cases = make_cases(arguments.pictures)
         result["inpainting"] = measure_inpainting(
-            arguments.priors, cases, arguments.start, arguments.out / "inpainting"
+            arguments.priors, cases, arguments.start, arguments.noises, arguments.out / "inpainting"
         )
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
@@ -433,11 +452,12 @@ def main() -> None:
     if arguments.photographs:
         cases = make_photograph_cases(load_photographs(arguments.photographs, held_out=True), PHOTOGRAPH_CASES)
         result["photographs"] = measure_inpainting(
-            arguments.priors, cases, arguments.start, arguments.out / "photographs"
+            arguments.priors, cases, arguments.start, arguments.noises, arguments.out / "photographs"
         )
         for name, kinds in result["photographs"]["scores"].items():
             for kind in ("whole", "window"):
-                print(name, kind, {column: round(kinds[kind][column], 3) for column in COLUMNS}, flush=True)
+                shown = {column: round(kinds[kind][column], 3) for column in COLUMNS}
+                print(name, kind, shown, "LPIPS over Telea's:", kinds[kind]["lpips_over_telea"], flush=True)
     if arguments.run:
         params = profile_params(first, dict(arguments.set))
         result["personalization"] = measure_personalization(
