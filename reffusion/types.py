@@ -200,8 +200,8 @@ class MaskSet:
             The photograph must not supervise these pixels, unless the view is clean (`Scene.clean`): its photograph
             does not show the object there. In a view without a photograph, C also holds the pixels that no photograph
             of another view shows.
-        unobserved: U, True at those pixels of C where no other photograph shows the background, i.e. what is visible
-            there once the object is removed. With `masks.invent: consistent` this is not examined, and U is C.
+        unobserved: U, True at those pixels of C where too few other photographs show the background, i.e. what is
+            visible there once the object is removed. With `masks.invent: consistent` this is not examined, and U is C.
         invent: I, True at the pixels whose content is invented by reference and prior. These are the pixels of U (of C
             with `masks.invent: consistent`), and the pixels that the scene asks to fill. All are False if U is
             negligible in all views together (`masks.consolidation.drop_negligible`).

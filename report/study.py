@@ -149,7 +149,7 @@ def _load_test_views(run: Run) -> Clip | None:
 
 
 def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
-    """Save a clip as .webm, or without an encoder as a PNG of stills; return its address relative to the page."""
+    """Save a clip in `folder`, as .webm or (no encoder) a PNG of stills; return its address, clips/<file>."""
     try:
         save_video(folder / f"{name}.webm", frames, rate)
     except ValueError:  # no video encoder is available

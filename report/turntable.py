@@ -46,8 +46,8 @@ def make(home: Path, frames: int = FRAMES) -> Path:
 def make_wipe(home: Path, frames: int = WIPE_FRAMES) -> Path:
     """Render before and after along the path of the video, and write `home`/before_after.webm and .webp.
 
-    A line moves across the picture, left of which is the scene with the object. The video is as large as the
-    photographs, but at most `FILM_WIDTH` px wide; the animated picture (.webp) is `WIPE_WIDTH` px wide.
+    A line swings to and fro; left of it is the scene with the object. The video is as wide as the photographs, within
+    `WIPE_WIDTH` to `FILM_WIDTH` px; the animated .webp is `WIPE_WIDTH` px wide.
 
     Args:
         home: as for `make`; the stage `fit` has run, too.

@@ -197,6 +197,14 @@ def test_of_the_networks_masks_the_one_with_edges_around_it_is_selected():
     assert (apply_marks(view, make_clicks((120, 120))) == disk).all()
 
 
+def test_a_first_click_takes_no_pixel_below_an_earlier_stroke_that_is_not_the_object():
+    picture, disk = disk_picture()
+    stroke = Mark(np.array([[90.0, 120.0], [110.0, 120.0]]), False, radius=6.0)
+    view = ViewEvidence(picture, None, lambda _: [Candidate(disk, 0.9)])
+    found = apply_marks(view, [stroke, *make_clicks((140, 120))])
+    assert (found == disk & ~stroke_pixels(stroke, disk.shape)).all() and (found != disk).any()
+
+
 # ---------------------------------------------------------------------------------------------- all views
 
 

@@ -156,7 +156,7 @@ def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patch
     disk the patch's ray meets the sphere.
 
     Args:
-        scenes: the Gaussians that lie inside the sphere. The first scene sets the number of spherical harmonics.
+        scenes: Gaussians inside the sphere. The first scene (required) sets the harmonics and `antialiased`.
         cameras: the cameras that lie inside the sphere. Its center is the mean of their centers.
     """
     centers = np.stack([camera.center for camera in cameras])

@@ -46,7 +46,7 @@ class Background:
         center: [3], the middle of the object.
         radius: radius around the center that contains most of the object; infinite if nothing is removed.
         points: [P, 3], the scene's sparse points.
-        unobserved: view name -> bool [H, W], True at pixels of C whose background no photograph shows.
+        unobserved: view name -> bool [H, W], True at pixels of C whose background too few photographs show.
         camera_only: names of the camera-only views, which have no photograph.
         completed: the views that were completed earlier. For each, its depth without the object, and its picture, uint8
             [H, W, 3].

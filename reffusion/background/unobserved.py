@@ -1,7 +1,7 @@
 """The split of a view's consistent mask C (the pixels that show the object) into observed and unobserved pixels.
 
-A pixel is *unobserved* if no other photograph shows the background there, i.e. the surface that becomes visible once
-the object is removed.
+A pixel is *unobserved* if too few other photographs show the background there, the surface that is visible once the
+object is removed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class HoleGeometry:
     """The surfaces that one view shows once the object is removed.
 
     Attributes:
-        unobserved: bool [H, W], True at the pixels of C whose background no photograph shows.
+        unobserved: bool [H, W], True at pixels of C whose background too few views show.
         continued_depth: [H, W], at unobserved pixels the camera z of the nearest plane that continues there, or of the
             plausible mirror image of a symmetric thing; inf where there is neither, and at all other pixels.
         depth: [H, W] float64 camera z, rendered from the remaining Gaussians (those without the object). Outside the

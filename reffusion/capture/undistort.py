@@ -86,7 +86,7 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     test_masks/<view>.png and fill/<view>.png. They have the size of `lens`.
 
     Args:
-        lens: lens of the view's photograph at the size of the undistorted picture, see `reffusion.capture.lenses`.
+        lens: lens of the view's photograph, with its distortion, at the size of the undistorted picture.
 
     Raises:
         BadInput: a mask is unreadable; the message names the file.

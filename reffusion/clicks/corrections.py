@@ -30,8 +30,7 @@ def apply_marks(
 
     A stroke changes the pixels below the brush. A box changes only pixels inside it. While the mask is empty, a click
     on the object selects the object. Each later click adds or removes one connected region around the clicked pixel.
-    Clicks and boxes change no pixel that earlier marks confirm to be the opposite. So a click never changes pixels that
-    are not connected with it.
+    Clicks and boxes change no pixel that earlier marks confirm to be the opposite.
 
     Args:
         marks: all marks of the view, in the order in which they were made.
@@ -50,7 +49,7 @@ def apply_marks(
         elif mask.any():
             mask = correct_mask(view, mask, done)
         elif mark.positive:
-            mask = segment_view(view, clicks_of(done), mark.size)
+            mask = segment_view(view, clicks_of(done), mark.size) & (confirmed_pixels(done, shape) != OTHER)
     return mask
 
 

@@ -67,7 +67,7 @@ def find_origins(draft: Draft, camera: Camera, masks: MaskSet, background: Backg
     Args:
         draft: the filled scene.
         camera: the view.
-        masks: the view's pixel classes: C, and the pixels of C whose background no photograph shows.
+        masks: the view's pixel classes: C, and the pixels of C whose background too few photographs show.
         background: the photographs with which the scene is compared; None to find no conflicts.
     """
     kinds = torch.stack([draft.origin == REFERENCE, draft.origin == EXTRA_VIEW, draft.is_new], -1)

@@ -1,4 +1,4 @@
-"""Deterministic 2D inpainting by LaMa, from a TorchScript file on this machine, or by OpenCV's methods.
+"""Deterministic 2D inpainting: OpenCV's methods, and the network LaMa from a local TorchScript file.
 
 Nothing is downloaded. Holes are bool [H, W], True for the pixels to fill.
 """

@@ -1,4 +1,4 @@
-"""Reading and writing of Gaussians (PLY of 3DGS and other formats), and of colored points as PLY."""
+"""Writing of Gaussians in every format (`save_splats`), reading to tensors; colored points as PLY."""
 
 from __future__ import annotations
 

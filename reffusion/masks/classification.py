@@ -1,7 +1,7 @@
 """Classification of a scene: which Gaussians are the object, and the class of every pixel of every view.
 
 Raw masks vote on which Gaussians are the object. The labelled Gaussians are rendered into each view, which gives its
-consistent mask C. Pixels of C behind which no other photograph shows the background are unobserved (U). Pixels to be
+consistent mask C. Pixels of C whose background too few other photographs show are unobserved (U). Pixels to be
 invented are the invent mask I, see `reffusion.types.MaskSet`.
 """
 

@@ -1,8 +1,8 @@
 """Consistent masks and pixel classes: label the object's Gaussians, render the labels, and classify each view's pixels.
 
 The pixel classes of a view (`MaskSet`) are: C, the consistent mask, where the view shows the object; U, the pixels of C
-whose background no other photograph shows; I, the pixels to be invented. A *clean* view was photographed without the
-object.
+whose background too few other photographs show; I, the pixels to be invented. A *clean* view was photographed without
+the object.
 """
 
 from __future__ import annotations
@@ -221,6 +221,6 @@ def count_pixels(kind: str, sets: Mapping[str, MaskSet], names: Sequence[str]) -
 def unobserved_share(sets: Mapping[str, MaskSet], names: Sequence[str]) -> float:
     """Return the share of the consistent masks' pixels that are unobserved, in [0, 1], over the views `names` together.
 
-    Behind an unobserved pixel no photograph shows the background. The share is 0 if all consistent masks are empty.
+    Behind an unobserved pixel too few photographs show it. The share is 0 if all consistent masks are empty.
     """
     return count_pixels("unobserved", sets, names) / max(count_pixels("consistent", sets, names), 1)

@@ -90,7 +90,7 @@ def find_floaters(
 ) -> Tensor:
     """Find floaters: Gaussians that contribute mostly to unobserved pixels once the object is removed.
 
-    An unobserved pixel shows a place behind the object that no other photograph shows. No photograph supervised the fit
+    Too few other photographs show the place behind an unobserved pixel. They hardly supervised the fit
     there, so Gaussians may extend far into or behind the object. Floaters are found by the same vote as the object,
     with the unobserved pixels as masks, and without the object's Gaussians.
 

@@ -64,7 +64,7 @@ class Settings(BaseModel):
 
 
 def to_slashes(value: Any) -> Any:
-    """Return a path, or a list of paths, with slashes for the backslashes of Windows. Other values stay as they are."""
+    """Return a string, or each string of a list, with slashes for backslashes. Other values, even a Path, stay."""
     if isinstance(value, list):
         return [to_slashes(each) for each in value]
     return value.replace("\\", "/") if isinstance(value, str) else value

@@ -76,7 +76,7 @@ def list_teaching_files(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the files of the pictures that only personalize the prior, which scene.yaml names by the key `teach`.
 
     Raises:
-        BadInput: a file is missing, or two files have the same name.
+        BadInput: a file is missing, or two have the same stem.
     """
     paths = [Path(folder) / name for name in names]
     for path in paths:

@@ -143,10 +143,10 @@ class Jobs:
         return profile if profile in QUALITIES else ""
 
     def choose_quality(self, scene: OpenScene, profile: str) -> None:
-        """Take a profile of `QUALITIES` for all further plans and jobs of a scene.
+        """Save one of `QUALITIES` as a scene's profile for later jobs, and plan anew.
 
         Raises:
-            ValueError: the profile is none of them, or a job of the scene runs.
+            ValueError: not such a profile, the scene's profile is fixed, or a job of the scene runs.
         """
         if profile not in QUALITIES or not self.quality(scene):
             raise ValueError(f"there is no quality {profile!r} to choose")

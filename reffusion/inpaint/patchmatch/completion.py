@@ -250,7 +250,7 @@ def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
 
 
 def _vote(level: Level, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
-    """Fill the hole of `level.current` in place with the mean of covering patches, weighted by trust and misfit."""
+    """Set the first `VOTED` channels of hole pixels `todo` (None: all) to the weighted mean of covering patches."""
     todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
     # the weight of a patch falls by a factor of e per `spread` of misfit
     voting.vote(todo, matches, level.hole, trust, level.sources, spread, voted)
