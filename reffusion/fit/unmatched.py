@@ -20,6 +20,7 @@ CELL = 6  # px: a point is added for each empty cell of this side
 REACH = 3  # cells: one that is nearer than this to a cell with a point needs no point of its own
 SMOOTHING = 5  # cells: side of the window in which the depth of cells with points is a median
 FARTHER = 1.5  # factor by which a point moves away while another view sees past it
+MAX_WITNESSES = 24  # number of views that are asked, so that time grows linearly with the views
 
 
 def place_unmatched(
@@ -27,8 +28,8 @@ def place_unmatched(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Add a point for each cell of a view that shows no point.
 
-    Its depth is that of the nearest cell that shows one, times powers of `FARTHER` until no other view sees past the
-    point; a point beyond `FARTHEST` is moved to this depth.
+    Its depth is that of the nearest cell that shows one, times powers of `FARTHER` until none of `MAX_WITNESSES` views
+    sees past the point; a point beyond `FARTHEST` is moved to this depth.
 
     Args:
         cameras: the views, in the normalised frame.
@@ -38,6 +39,7 @@ def place_unmatched(
     Returns:
         The added points [A, 3] float64 and their colors [A, 3] uint8.
     """
+    witnesses = cameras[:: -(-len(cameras) // MAX_WITNESSES)]
     seen = {camera.name: _depth_of_cells(camera, points) for camera in cameras}
     added, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
     for camera in cameras:
@@ -51,8 +53,10 @@ def place_unmatched(
         pixels = np.stack([(columns + 0.5) * CELL, (rows + 0.5) * CELL], 1)
         inside = (pixels < (camera.width, camera.height)).all(1)
         pixels, depths = pixels[inside], smooth[tuple(nearest[:, rows[inside], columns[inside]])]
-        while (passed := (depths < FARTHEST) & _is_seen_past(unproject(camera, pixels, depths), cameras, seen)).any():
-            depths = np.where(passed, depths * FARTHER, depths)
+        left = np.arange(len(depths))
+        while len(left := left[_is_seen_past(unproject(camera, pixels[left], depths[left]), witnesses, seen)]):
+            depths[left] *= FARTHER
+            left = left[depths[left] < FARTHEST]
         added = np.concatenate([added, unproject(camera, pixels, np.minimum(depths, FARTHEST))])
         columns, rows = pixels.astype(int).T
         colors.append(cv2.blur(images[camera.name], (CELL, CELL))[rows, columns])
@@ -60,7 +64,7 @@ def place_unmatched(
 
 
 def _is_seen_past(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return bool [P], True for points before what a view shows in their cell, by its depth of cells in `seen`."""
+    """Return bool [P], True for points in front of what a view shows in their cell, by its depth of cells in `seen`."""
     past = np.zeros(len(points), bool)
     for camera in cameras:
         cells, depth = _locate(camera, points)
