@@ -70,7 +70,8 @@ ACTIVE = {
     "masks.vote": "masks/classification masks/voting masks/consolidation masks/regions",
     "masks.invent": "background/model background/visibility",
     "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
-    "reference.candidates": "references/completion references/files references/view_ranking depth/inpaint_depth",
+    "reference.candidates": "references/completion references/files references/view_ranking depth/inpaint_depth "
+    "clicks/sam_onnx",
     "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
     "personalize.lora.rank": "prior/lora",
     "initialize.start": "initialize/filling initialize/draft initialize/draft_operations initialize/fill "
