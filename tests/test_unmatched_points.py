@@ -1,18 +1,18 @@
 """Initial points where no match between views gives one: at the depth beside them, and not before what others see."""
 
 import numpy as np
-from scenes.cameras import make_camera, project_points
+from scenes.cameras import make_camera, project_points, yaw
 
-from reffusion.fit.unmatched import CELL, REACH, place_unmatched
+from reffusion.fit.unmatched import CELL, FARTHER, REACH, place_unmatched
 
 SIZE, FOCAL, DEPTH = (160, 120), 150.0, 3.0
 HERE = make_camera("here", SIZE, FOCAL, (0.0, 0.0, 0.0), np.eye(3))
 
 
-def wall(depth: float, columns: tuple[float, float], camera=HERE) -> np.ndarray:
+def wall(depth: float, columns: tuple[float, float]) -> np.ndarray:
     """Return a point for each second pixel of some columns of a camera at the origin, at a depth."""
     x, y = np.meshgrid(np.arange(*columns, 2.0), np.arange(1.0, SIZE[1], 2.0))
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    rays = np.stack([(x - HERE.cx) / HERE.fx, (y - HERE.cy) / HERE.fy, np.ones_like(x)], -1)
     return (rays * depth).reshape(-1, 3)
 
 
@@ -32,18 +32,22 @@ def test_points_continue_the_surface_beside_them():
 
 
 def test_no_point_stands_before_what_another_view_sees():
-    """Beside a pole lies forest that one view alone shows; another view sees a far wall through the same place."""
-    there = make_camera("there", SIZE, FOCAL, (1.5, 0.0, 0.0), np.eye(3))
-    far = wall(9.0, (0, SIZE[0])) + np.array([1.5, 0.0, 0.0])
-    far = far[project_points(far, HERE)[:, 0] > SIZE[0]]
-    added, _ = place_unmatched(
-        [HERE, there], {"here": picture(), "there": picture()}, np.concatenate([wall(DEPTH, (0, 40)), far])
+    """Beside a pole lies forest that one view alone shows; another view looks across, at the pole and a wall."""
+    across = make_camera("across", SIZE, FOCAL, (3.0, 0.0, DEPTH), yaw(-np.pi / 2))
+    x, y, z = wall(7.0, (0, SIZE[0])).T
+    far = np.stack([3.0 - z, y, DEPTH + x], 1)
+    pole = wall(DEPTH, (0, 40))
+    points = np.concatenate([pole, far])
+    added, _ = place_unmatched([HERE, across], {"here": picture(), "across": picture()}, points)
+    own = added[added[:, 0] > 3.0 - 7.0 + 1e-6]
+    shown = project_points(own, across)
+    seen = (own[:, 0] < 3.0) & (shown > 0).all(1) & (shown < SIZE).all(1)
+    assert not (3.0 - own[seen, 0] < 0.9 * (3.0 - pole[:, 0].max())).any()
+    powers = np.log(own[:, 2] / DEPTH) / np.log(FARTHER)
+    np.testing.assert_allclose(powers, powers.round(), atol=1e-6)
+    assert powers.min() > -0.5 and powers.max() > 0.5, (
+        "some stay beside the pole's depth or move away, none comes nearer"
     )
-    assert len(added)
-    shown = project_points(added, there)
-    before = (added[:, 2] < 0.9 * 9.0) & (shown > 0).all(1) & (shown < SIZE).all(1)
-    seen = np.unique((project_points(far, there) // CELL).astype(int), axis=0)
-    assert not any((cell == seen).all(1).any() for cell in (shown[before] // CELL).astype(int))
 
 
 def test_views_that_show_points_everywhere_or_nowhere_get_none():

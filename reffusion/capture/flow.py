@@ -302,17 +302,45 @@ def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- points
 
 
+def locate_cells(camera: Camera, points: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index of the cell in which a view shows each point, row by row, -1 if in none; and the points' depths.
+
+    Args:
+        points: [P, 3] in the world.
+        cell: side of a cell in pixels. The last cells may reach beyond the picture.
+
+    Returns:
+        Indices [P], and depths [P], camera z.
+    """
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    cells, front = np.full(len(local), -1), np.flatnonzero(local[:, 2] > 1e-3)
+    x, y, z = local[front].T
+    column = np.floor((x / z * camera.fx + camera.cx) / cell)
+    row = np.floor((y / z * camera.fy + camera.cy) / cell)
+    high, wide = cell_grid(camera, cell)
+    inside = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
+    cells[front[inside]] = (row[inside] * wide + column[inside]).astype(int)
+    return cells, local[:, 2]
+
+
+def depth_of_cells(camera: Camera, points: np.ndarray, cell: int) -> np.ndarray:
+    """Return [h, w], the least depth of the points in each cell of a view, infinite where there is none."""
+    cells, depth = locate_cells(camera, points, cell)
+    shown = cells >= 0
+    least = np.full(cell_grid(camera, cell), np.inf)
+    np.minimum.at(least.reshape(-1), cells[shown], depth[shown])
+    return least
+
+
+def cell_grid(camera: Camera, cell: int) -> tuple[int, int]:
+    """Return the numbers of rows and columns of cells that cover a view."""
+    return -(-camera.height // cell), -(-camera.width // cell)
+
+
 def _is_covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: np.ndarray, cell: int) -> np.ndarray:
     """Return bool [P], True if an existing point is in the pixel's cell, in front of the pixel or at its depth."""
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    local = local[local[:, 2] > 1e-3]
-    column = np.floor((local[:, 0] / local[:, 2] * camera.fx + camera.cx) / cell)
-    row = np.floor((local[:, 1] / local[:, 2] * camera.fy + camera.cy) / cell)
-    wide, high = -(-camera.width // cell), -(-camera.height // cell)
-    inside = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
-    grid = np.full((high, wide), np.inf)
-    np.minimum.at(grid, (row[inside].astype(int), column[inside].astype(int)), local[inside, 2])
-    nearest = grid[(pixels[:, 1] // cell).astype(int), (pixels[:, 0] // cell).astype(int)]
+    columns, rows = (pixels // cell).astype(int).T
+    nearest = depth_of_cells(camera, points, cell)[rows, columns]
     return nearest < depth * (1 + geometry.SAME_IF_COARSE)
 
 

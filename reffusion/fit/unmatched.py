@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, median_filter
 
-from reffusion.capture.flow import FARTHEST, unproject
+from reffusion.capture.flow import FARTHEST, depth_of_cells, locate_cells, unproject
 from reffusion.geometry import SAME_IF_COARSE
 from reffusion.types import Camera
 
@@ -40,10 +40,10 @@ def place_unmatched(
         The added points [A, 3] float64 and their colors [A, 3] uint8.
     """
     witnesses = cameras[:: -(-len(cameras) // MAX_WITNESSES)]
-    seen = {camera.name: _depth_of_cells(camera, points) for camera in cameras}
+    seen = {camera.name: depth_of_cells(camera, points, CELL) for camera in cameras}
     added, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
     for camera in cameras:
-        depth = np.minimum(seen[camera.name], _depth_of_cells(camera, added))
+        depth = np.minimum(seen[camera.name], depth_of_cells(camera, added, CELL))
         shown = np.isfinite(depth)
         if not shown.any():
             continue
@@ -67,28 +67,8 @@ def _is_seen_past(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[s
     """Return bool [P], True for points in front of what a view shows in their cell, by its depth of cells in `seen`."""
     past = np.zeros(len(points), bool)
     for camera in cameras:
-        cells, depth = _locate(camera, points)
+        cells, depth = locate_cells(camera, points, CELL)
         inside = np.flatnonzero(cells >= 0)
         behind = seen[camera.name].reshape(-1)[cells[inside]]
         past[inside] |= np.isfinite(behind) & (depth[inside] < behind * (1 - SAME_IF_COARSE))
     return past
-
-
-def _depth_of_cells(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return the least depth of the points in each cell of a view, infinite where there is none."""
-    high, wide = -(-camera.height // CELL), -(-camera.width // CELL)
-    cells, depth = _locate(camera, points)
-    least = np.full(high * wide, np.inf)
-    np.minimum.at(least, cells[cells >= 0], depth[cells >= 0])
-    return least.reshape(high, wide)
-
-
-def _locate(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the cell in which a view shows each point, -1 if in none, and the points' depths."""
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = local[:, 2]
-    front = np.maximum(depth, 1e-3)
-    x, y = local[:, 0] / front * camera.fx + camera.cx, local[:, 1] / front * camera.fy + camera.cy
-    inside = (depth > 1e-3) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    column, row = (np.where(inside, each, 0).astype(int) // CELL for each in (x, y))
-    return np.where(inside, row * -(-camera.width // CELL) + column, -1), depth
