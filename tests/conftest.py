@@ -52,8 +52,3 @@ def wall_folders(tmp_path):
     from scenes.references import write_wall_stages
 
     return write_wall_stages(tmp_path)
-
-
-def pytest_collection_modifyitems(items):
-    """Run test_resume.py, the longest file, first. Two test processes would otherwise end with one idle process."""
-    items.sort(key=lambda item: item.path.name != "test_resume.py")

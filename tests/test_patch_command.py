@@ -50,27 +50,37 @@ def parse_arguments(before, after, out, **others) -> argparse.Namespace:
 
 
 def test_errors_are_one_line(splat_files, tmp_path):
+    before, _ = splat_files
+    ended = run_module("reffusion.command", "patch")
+    message = "name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply"
+    assert (ended.returncode, ended.stderr) == (2, f"error: {message}\n")
+    ended = run_module("reffusion.command", "patch", before, tmp_path / "no.ply", "--out", tmp_path / "patched.ply")
+    assert (ended.returncode, ended.stderr) == (2, f"error: {tmp_path / 'no.ply'}: no such file\n")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_arguments_that_do_not_fit_are_named(splat_files, tmp_path):
     before, after = splat_files
     out = tmp_path / "patched.ply"
     (tmp_path / "s.usdz").write_bytes(bytes(4096))
-    for arguments, message in (
-        ((), "name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply"),
-        ((before,), f"{before}: name two files, the scene before and after the object was deleted"),
-        ((before, after), "--out: name the file to write, as --out patched.ply"),
-        ((before, after, "--out", out, "--scene", "x"), "--scene, --variant: a scene's folder names its files in "
-         "scene.yaml; give it, or two files"),
-        ((before, tmp_path / "no.ply", "--out", out), f"{tmp_path / 'no.ply'}: no such file"),
-        ((before, tmp_path / "s.usdz", "--out", out), f"{tmp_path / 's.usdz'}: .usdz is not read; save the scene as "
-         ".ply in the program that wrote it"),
-        ((before, after, "--out", tmp_path / "x.obj"), f"{tmp_path / 'x.obj'}: .obj is not written; one of .ply, "
+    for files, others, message in (
+        ([before], {}, f"{before}: name two files, the scene before and after the object was deleted"),
+        ([before, after], {"out": None}, "--out: name the file to write, as --out patched.ply"),
+        ([before, after], {"scene": "x"}, "--scene, --variant: a scene's folder names its files in scene.yaml; give "
+         "it, or two files"),
+        ([before, tmp_path / "s.usdz"], {}, f"{tmp_path / 's.usdz'}: .usdz is not read; save the scene as .ply in the "
+         "program that wrote it"),
+        ([before, after], {"out": tmp_path / "x.obj"}, f"{tmp_path / 'x.obj'}: .obj is not written; one of .ply, "
          ".compressed.ply, .spz, .splat, .glb is"),
-        ((before, after, "--out", tmp_path / "no" / "x.ply"), f"{tmp_path / 'no'}: no such folder"),
-        ((before, after, "--out", out, "--cameras", tmp_path / "no"), f"{tmp_path / 'no'}: no such folder; --cameras "
-         "names one with transforms.json or sparse/0"),
+        ([before, after], {"out": tmp_path / "no" / "x.ply"}, f"{tmp_path / 'no'}: no such folder"),
+        ([before, after], {"cameras": tmp_path / "no"}, f"{tmp_path / 'no'}: no such folder; --cameras names one with "
+         "transforms.json or sparse/0"),
     ):  # fmt: skip
-        ended = run_module("reffusion.command", "patch", *arguments)
-        assert (ended.returncode, ended.stderr) == (2, f"error: {message}\n")
-        assert not (tmp_path / "runs").exists()
+        arguments = parse_arguments(before, after, **{"out": out} | others)
+        arguments.files = files
+        with pytest.raises(BadInput) as refused:
+            patch_files.check_arguments(arguments)
+        assert str(refused.value) == message
 
 
 def test_a_stage_that_refuses_ends_the_command(splat_files, tmp_path):

@@ -1,6 +1,7 @@
 """Resume of a small scene, end to end: the runner is killed at random moments, and the result is that of a whole run.
 
-RESUME_KILLS sets the number of kills: 1 by default to save time, 20 before a release.
+It takes minutes, so it runs with `make test slow=1`; the tests of each stage with checkpoints interrupt and resume it.
+RESUME_KILLS sets the number of kills: 3, or 20 before a release.
 """
 
 from __future__ import annotations
@@ -23,10 +24,13 @@ from runner.keys import Hashes
 from runner.plan import decide
 from runner.resolve import Request, resolve
 
-pytestmark = pytest.mark.integration
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes"),
+]
 
 ROOT = Path(__file__).resolve().parent.parent
-KILLS = int(os.environ.get("RESUME_KILLS", "1"))
+KILLS = int(os.environ.get("RESUME_KILLS", "3"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")
 # The order in which stages are killed. Stages with checkpoints come first.
 IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
