@@ -132,7 +132,9 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
     laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
     size = {"prior", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
-    chosen = {"iterations", "repaint", "lr.shape", "lr.epsilon"}  # values that the paper leaves open
+    # values that the paper leaves open
+    chosen = {"iterations", "repaint", "sds.t_high_last", "sds.guidance"}
+    chosen |= {"lr.masked", "lr.shape", "lr.opacities", "lr.epsilon"}
     by_size = {"adversarial.weight"}  # the paper's, for each pixel of a patch
     paper, ours, theirs = (
         by_dotted_name(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
