@@ -72,13 +72,13 @@ ACTIVE = {
     "reference.prior": "prior/inpaint prior/harmonic_fill prior/model prior/diffusion prior/memory prior/windows",
     "reference.candidates": "references/completion references/files references/view_ranking depth/inpaint_depth "
     "clicks/sam_onnx",
-    "personalize.steps": "prior/personalize prior/crops prior/denoising prior/threads prior/validation",
+    "personalize.steps": "prior/personalize prior/crops prior/denoising prior/validation",
     "personalize.lora.rank": "prior/lora",
     "initialize.start": "initialize/filling initialize/draft initialize/draft_operations initialize/fill "
     "initialize/unprojection initialize/origins initialize/summary",
     "initialize.depth.model": "depth/monocular depth/estimates depth/alignment depth/background_depth depth/bilateral "
     "depth/completion depth/solverlog",
-    "distill.iterations": "distill/inputs distill/loop distill/train_view distill/terms/term distill/overlap_worker",
+    "distill.iterations": "distill/inputs distill/loop distill/train_view distill/terms/term",
     "distill.confined": "distill/regions",
     "distill.densify.every": "distill/densification",
     "distill.sds.weight": "distill/sds distill/terms/sds distill/display_range prior/levels",

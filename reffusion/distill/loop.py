@@ -28,7 +28,6 @@ from torch import Tensor
 
 from reffusion import seeding, trace
 from reffusion.distill.densification import densify_masked
-from reffusion.distill.overlap_worker import OverlapWorker
 from reffusion.distill.regions import build_region, has_changed_region
 from reffusion.distill.terms import adversarial, depth, lift, reconstruction, reference, sds
 from reffusion.distill.terms.term import Term, TermInputs
@@ -41,7 +40,8 @@ from reffusion.params.distill import LearningRates, Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-TERMS = sds, depth, adversarial, reference, lift, reconstruction  # in the order in which their gradients are added
+# In the order in which their gradients are added. SDS comes first, because its own gradient is logged.
+TERMS = sds, depth, adversarial, reference, lift, reconstruction
 SNAPSHOTS = 4  # parts of the run; the masked Gaussians are saved at the end of each but the last
 DENSIFIED_UNTIL = 0.5  # fraction of a run after which no Gaussian is added, as in 3DGS
 AVERAGED_FROM = 2 / 3  # fraction of a run without densification after which the Gaussians of all steps are averaged
@@ -58,14 +58,12 @@ class Objective:
         settings: Parameters of the stage `distill`.
         latest: Values that are repeated in every line of the trace: the last values of terms that are not computed in
             every step, and the numbers of skipped views. They change from step to step, and checkpoints contain them.
-        worker: Computes the terms that run apart (see `Term`).
     """
 
     terms: Sequence[Term]
     references: Sequence[ReferenceHole]
     settings: Params
     latest: dict[str, float]
-    worker: OverlapWorker
 
 
 def build_objective(inputs: TermInputs, settings: Params) -> Objective:
@@ -79,10 +77,7 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
         ValueError: A term lacks an input that it needs.
     """
     terms = [term for module in TERMS if (term := module.build(inputs, settings)) is not None]
-    # On a GPU nothing is gained, because it runs one kernel after another.
-    overlaps = not inputs.masked_means.is_cuda and all(term.runs_apart or term.allows_overlap for term in terms)
-    overlaps = overlaps and any(term.runs_apart for term in terms)
-    return Objective(terms, inputs.references, settings, {}, OverlapWorker(torch.get_num_threads() if overlaps else 1))
+    return Objective(terms, inputs.references, settings, {})
 
 
 def distill(
@@ -152,21 +147,11 @@ def take_step(optimizer: GaussianOptimizer, step: int, objective: Objective) -> 
         step: Number of the step, from 0.
         objective: The weighted sum. Its `latest` is updated.
     """
-    background, foreground = [], []
+    moved, line = torch.zeros_like(optimizer.masked), {}
     for term in objective.terms:
-        (background if term.runs_apart else foreground).append(term)
-    gaussians, masked = optimizer.gaussians, optimizer.masked
-    apart = gaussians.map(lambda p: p.detach().requires_grad_())  # accumulates the gradient of the terms that run apart
-    with objective.worker.overlap(lambda: [_add_gradient(term, step, apart, masked) for term in background]) as result:
-        parts = [_add_gradient(term, step, gaussians, masked) for term in foreground]
-    parts = [part for part in (*result(), *parts) if part is not None]
-    for name in PARAMETERS:
-        parameter, gradient = getattr(gaussians, name), getattr(apart, name).grad
-        if gradient is not None:
-            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-
-    moved, line = torch.zeros_like(masked), {}
-    for part in parts:
+        part = _add_gradient(term, step, optimizer.gaussians, optimizer.masked)
+        if part is None:
+            continue
         moved |= part.moved
         line |= part.log
         objective.latest.update(part.latest)
@@ -214,7 +199,7 @@ def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -
             return _Contribution(torch.zeros_like(masked), {}, skipped=f"{label}_skipped_{reason}")
         _backward(term.weight * value.loss, gaussians)
     log, radii, observed = dict(value.log), value.rendering.radii, None
-    if term.runs_apart:
+    if term.logs_gradient:
         norms = _gradient_norms(gaussians, masked)
         log |= {f"{label}_gradient_mean": float(norms.mean()), f"{label}_gradient_max": float(norms.max())}
     if value.probe is not None:

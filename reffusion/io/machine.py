@@ -171,15 +171,3 @@ def _nvcc() -> str | None:
     with suppress(OSError, ValueError, KeyError):
         return str(json.loads((home / "version.json").read_text())["cuda"]["version"])
     return ""
-
-
-def idle_seconds() -> float:
-    """Return the idle time since boot in seconds, summed over all cores; infinity if unknown.
-
-    Waiting for disks counts as idle.
-    """
-    try:
-        ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
-    except (OSError, ValueError):
-        return float("inf")
-    return (ticks[3] + ticks[4]) / os.sysconf("SC_CLK_TCK")

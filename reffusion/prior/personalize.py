@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import ceil, cos, inf, isfinite, pi
+from math import cos, inf, isfinite, pi
 from pathlib import Path
 
 import torch
 
 from reffusion import trace
+from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.personalize import Params
 from reffusion.prior import diffusion, lora
 from reffusion.prior.crops import Batch, Picture, draw_samples
 from reffusion.prior.denoising import denoising_error, latent_shape, spread_timesteps
 from reffusion.prior.model import Prior
-from reffusion.prior.threads import Threads
 from reffusion.prior.validation import make_held_out, measure_errors
 from reffusion.seeding import generator as seeded
 
@@ -43,6 +43,7 @@ def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> 
     return 0.5 * (1 + cos(pi * (step - warm_up) / max(steps - warm_up, 1)))
 
 
+@torch_on_one_thread()
 def personalize(
     prior: Prior,
     trained: dict[str, list[torch.nn.Parameter]],
@@ -53,7 +54,7 @@ def personalize(
 ) -> None:
     """Train the prior's LoRA in place, from the start or from the checkpoint in `folder`.
 
-    A resumed training equals an unbroken one bit for bit on one CPU thread.
+    On the CPU a resumed training equals an unbroken one bit for bit.
 
     Args:
         prior: The prior with LoRA layers attached.
@@ -82,34 +83,31 @@ def personalize(
     log, checkpoints = trace.Trace(folder, seconds, start), trace.Checkpoints(folder, settings.checkpoint_seconds)
     validation_set = make_held_out(references, photographs, prior.native_size, settings.seed)
     references = [replace(each, image=each.image.to(prior.device)) for each in references]
-    threads = Threads(steps - start, prior.device)
 
     def measure(step: int, previous: float = inf) -> tuple[float, bool]:
         with log.paused():
-            errors = measure_errors(prior, validation_set, settings.prompts.texts, settings.seed, threads.map)
+            errors = measure_errors(prior, validation_set, settings.prompts.texts, settings.seed)
             error = errors["clean_latent_mse"]
             is_settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
             reason = "settled" if is_settled else "finished" if step == steps else ""
             log.log(step, **errors, **({"reason": reason} if reason else {}))
         return error, is_settled
 
-    with threads:
-        for step in trace.progress(steps, "personalize", start):
-            if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
-                error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
-                if is_settled:
-                    break
-            factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
-            for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
-            with threads.step():
-                train_step(prior, optimizer, references, settings, step, threads)
-            if checkpoints.due:
-                progress_state = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
-                progress_state |= {"error": error}
-                checkpoints.save(lambda progress_state=progress_state: progress_state | {"lora": lora.state(prior)})
-        else:
-            measure(steps)
+    for step in trace.progress(steps, "personalize", start):
+        if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
+            error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
+            if is_settled:
+                break
+        factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * factor
+        train_step(prior, optimizer, references, settings, step)
+        if checkpoints.due:
+            progress_state = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
+            progress_state |= {"error": error}
+            checkpoints.save(lambda progress_state=progress_state: progress_state | {"lora": lora.state(prior)})
+    else:
+        measure(steps)
     lora.set_dropout(prior, False)
 
 
@@ -127,12 +125,7 @@ def _check_size(prior: Prior, size: int) -> None:
 
 
 def train_step(
-    prior: Prior,
-    optimizer: torch.optim.Optimizer,
-    references: Sequence[Picture],
-    settings: Params,
-    step: int,
-    threads: Threads | None = None,
+    prior: Prior, optimizer: torch.optim.Optimizer, references: Sequence[Picture], settings: Params, step: int
 ) -> float:
     """Take one optimiser step, and return the mean loss of the batch before it.
 
@@ -144,7 +137,6 @@ def train_step(
         references: The pictures to learn.
         settings: Parameters of the stage `personalize`.
         step: Number of the step, from 0.
-        threads: Processes parts of the batch in parallel. None, or LoRA with dropout: one part after the other.
 
     Raises:
         FloatingPointError: Loss or gradient is not finite; the message names the step. The weights are unchanged.
@@ -157,7 +149,6 @@ def train_step(
     noise = torch.randn(count, *latent_shape(prior, size), generator=generator)
     # LoRA's dropout takes no generator, so the global one is seeded from that of the step.
     torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-    executor = threads if threads is not None and not settings.lora.dropout else None
     unet_parameters, text_parameters = (group["params"] for group in optimizer.param_groups)
     text = diffusion.embed_text(prior, settings.prompts.texts)
     detached_text = text.detach().requires_grad_()
@@ -168,11 +159,8 @@ def train_step(
         loss = error.sum() / count
         return loss.detach(), torch.autograd.grad(loss, [detached_text, *unet_parameters], allow_unused=True)
 
-    part_size = min(prior.rows_with_grad or count, ceil(count / (executor.now if executor else 1)))
-    parts = torch.arange(count).chunk(ceil(count / part_size))
-    losses, gradients = zip(
-        *(executor.map(loss_and_gradients, parts) if executor else map(loss_and_gradients, parts)), strict=True
-    )
+    parts = torch.arange(count).split(prior.rows_with_grad or count)
+    losses, gradients = zip(*map(loss_and_gradients, parts), strict=True)
     text_gradients, *parameter_gradients = map(_sum_gradients, zip(*gradients, strict=True))
     parameter_gradients += torch.autograd.grad(text, text_parameters, text_gradients, allow_unused=True)
     trained = [*unet_parameters, *text_parameters]

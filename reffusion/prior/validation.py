@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -74,9 +73,7 @@ def make_held_out(
     return HeldOut(reference, *(torch.stack(each) for each in (pictures, repaint, holes)))
 
 
-def measure_errors(
-    prior: Prior, held: HeldOut, prompts: list[str], seed: int, map_parts: Callable[..., Iterable] = map
-) -> dict[str, float]:
+def measure_errors(prior: Prior, held: HeldOut, prompts: list[str], seed: int) -> dict[str, float]:
     """Return the errors for the trace of personalization, by their key.
 
     All errors are measured in holes. "target_mse" and "clean_latent_mse" are the two errors of `denoising_error` for
@@ -93,18 +90,14 @@ def measure_errors(
         held: The samples.
         prompts: The global, the local and the empty prompt.
         seed: Seed of the noise.
-        map_parts: Function like `map`, which may run several calls at the same time.
     """
     lora.set_dropout(prior, False)
     with torch.no_grad():
         text = diffusion.embed_text(prior, prompts)
-    parts = [partial(_hole_errors, prior, held, text, seed, level) for level in NOISE_LEVELS] + [
-        partial(_one_step_psnr, prior, held, text, seed)
-    ]
-    *errors, psnr = map_parts(lambda part: part(), parts)
+    errors = [_hole_errors(prior, held, text, seed, level) for level in NOISE_LEVELS]
     target, clean = torch.stack(errors).mean(0)
     result = {"target_mse": float(target[0]), "clean_latent_mse": float(clean[0]), "crop_latent_mse": float(clean[1])}
-    return result | psnr
+    return result | _one_step_psnr(prior, held, text, seed)
 
 
 @torch.no_grad()

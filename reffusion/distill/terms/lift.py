@@ -46,7 +46,6 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
         select_view=cycle_through(views, settings.seed, "lift"),
         reaches=reach_hole(settings),
         loss=loss,
-        allows_overlap=True,
     )
 
 

@@ -41,7 +41,6 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
         every=settings.reconstruction.every,
         fills_hole=False,
         uses_one_thread=True,
-        allows_overlap=True,
     )
 
 

@@ -37,7 +37,6 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
         reaches=reach_hole(settings, everywhere=settings.reference.reaches == "all"),
         loss=loss,
         uses_one_thread=True,
-        allows_overlap=True,
     )
 
 

@@ -65,7 +65,8 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
         select_view=select_view,
         reaches=reach_hole(settings, everywhere=sds.reaches == "all"),
         loss=loss,
-        runs_apart=True,
+        uses_one_thread=not inputs.masked_means.is_cuda,
+        logs_gradient=True,
     )
 
 

@@ -78,10 +78,9 @@ class Term:
         every: Number of steps from one computation of the term to the next.
         fills_hole: Whether the term acts on masked Gaussians. Such a term is left out if there are none.
         uses_one_thread: Whether torch computes the term on one thread, which is faster if most of the work is
-            rendering.
-        runs_apart: Whether the term's gradient is accumulated separately from that of all other terms, so that its norm
-            can be logged. Such a term runs in another thread if this is faster.
-        allows_overlap: Whether the term may be computed at the same time as a term that runs apart.
+            rendering, or tensors are small.
+        logs_gradient: Whether the norm of the term's gradient is logged. Such a term is computed before all others,
+            which add their gradients to its own.
         state: The object that the term trains; None if it trains nothing.
     """
 
@@ -93,8 +92,7 @@ class Term:
     every: int = 1
     fills_hole: bool = True
     uses_one_thread: bool = False
-    runs_apart: bool = False
-    allows_overlap: bool = False
+    logs_gradient: bool = False
     state: Stateful | None = None
 
 
