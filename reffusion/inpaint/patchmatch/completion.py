@@ -195,7 +195,7 @@ def _stack_sources(
 
 def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequence[int], sources: Sources) -> Hole:
     """Collect the pixels of the hole at one level, full size divided by `scale`, with their geometry."""
-    rows, columns = np.nonzero(mask)
+    rows, columns = (np.ascontiguousarray(each) for each in np.nonzero(mask))
     index = np.full(mask.shape, -1)
     index[rows, columns] = np.arange(len(rows))
     at = np.minimum(rows * scale, target.plane.shape[0] - 1), np.minimum(columns * scale, target.plane.shape[1] - 1)
@@ -212,7 +212,8 @@ def _patch_positions(sources: Sources, last_plane: int) -> Positions:
     places = np.argwhere(sources.plane >= 0).astype(np.int32)
     plane = sources.plane[tuple(places.T)]
     parts = [places] + [places[plane == k] for k in range(1, last_plane + 1)]
-    return Positions(np.concatenate(parts), np.cumsum([0] + [len(part) for part in parts]))
+    places = np.ascontiguousarray(np.concatenate(parts))
+    return Positions(places, np.cumsum([0] + [len(part) for part in parts]))
 
 
 def _trust(mask: np.ndarray) -> np.ndarray:

@@ -112,6 +112,8 @@ misfit = kernel(misfit, FREE_ROUNDING)
 @inlined
 def _try_match(matches, n, along_plane, source, y, x, angle, level):
     """Give pixel n the patch if this patch fits better than the present one; arguments as of `misfit`."""
+    # as `matches` stores them; besides, the kernel is compiled for one type only
+    y, x, angle = np.float32(y), np.float32(x), np.float32(angle)
     value = misfit(n, along_plane, source, y, x, angle, matches.misfit[n], level)
     if value < matches.misfit[n]:
         matches.source[n], matches.row[n], matches.column[n] = source, y, x
