@@ -6,6 +6,7 @@ import ast
 import graphlib
 import importlib
 import inspect
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -222,3 +223,21 @@ def test_pure_modules_take_no_paths_and_no_params(path):
     inside = relative_path(path).removeprefix("reffusion/")
     if inside.startswith(PURE) and relative_path(path) != COMPILER:
         assert not {name.split(".")[0] for name in imports(path)} & {"pathlib", "pydantic", "os", "io"}
+
+
+def test_the_benchmark_sets_one_thread_before_numpy_and_torch_are_loaded():
+    """NumPy and PyTorch read the number once. With two threads, CPU seconds would include time spent waiting."""
+    probe = """
+import os, sys
+class Watch:
+    def find_spec(self, name, *_):
+        if name in ("numpy", "torch"):
+            print(name, os.environ.get("OMP_NUM_THREADS"), os.environ.get("OPENBLAS_NUM_THREADS"))
+sys.meta_path.insert(0, Watch())
+import lab.bench.__main__
+"""
+    others = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", probe], cwd=ROOT, env=others, capture_output=True, text=True, check=True
+    )
+    assert sorted(set(done.stdout.splitlines())) == ["numpy 1 1", "torch 1 1"]
