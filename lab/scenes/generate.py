@@ -176,10 +176,8 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
     else:
         removed = replace(world, solids=without_object(world.solids))
         references = _write_measured(out, session, session.completions, kind, removed, frame)
-        (out / "truth/depth").mkdir(parents=True, exist_ok=True)
-        for k, picture in enumerate(session.backgrounds, session.test):
-            write_image(out / f"truth/without_object/{session.names[k]}.png", picture)
-            np.save(out / f"truth/depth/{session.names[k]}.npy", depth(session.cameras[k], kind, removed, frame))
+        for name, picture in zip(session.names[session.test :], session.backgrounds, strict=True):
+            write_image(out / f"truth/without_object/{name}.png", picture)
     (out / "scene.yaml").write_text(references + PROFILE)
 
 
@@ -236,6 +234,8 @@ def _write_measured(
         name, measured = session.names[k], depth(session.cameras[k], kind, world, frame)
         write_image(out / f"references/{name}.png", picture)
         if kind.depth_error:
+            (out / "truth/depth").mkdir(parents=True, exist_ok=True)
+            np.save(out / f"truth/depth/{name}.npy", measured)
             draw = randomness(session.seed, f"estimate {name}")
             measured = estimate_disparity(measured, session.masks[k], kind.depth_error, draw)
         np.save(out / f"references/{name}.npy", measured)

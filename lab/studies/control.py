@@ -4,8 +4,7 @@ The embedded prior is small, so a result with it judges the prior as much as the
 exact prior instead (`exact_prior`): the posterior mean over fillings of the training views, which recognises view and
 window by their known pixels, as any inpainting model could. The personalized prior knows only the fillings that agree
 with the reference; the prior without personalization, and the empty prompt, know all. With --embedded the embedded
-prior is distilled, for comparison. No depth network runs here, so the depth term gets the true depth of each view with
-the errors that a network makes (`estimate_disparity`): all fillings lie on the same surfaces.
+prior is distilled, for comparison.
 
 The stages up to `initialize` run in the profile `paper-terms`. Then each of the `METHODS` distils from the same start.
 Scored are test views, in the box of the object: LPIPS (vgg) and PSNR, and PSNR outside. The study prints and writes
@@ -28,15 +27,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lab.scenes.kinds import KINDS, randomness
-from lab.scenes.tasks import estimate_disparity
 from lab.studies import scene_priors
 from lab.studies.exact_prior import make_fillings, make_prior
 from lab.studies.prior import keep_if_same
 from reffusion import geometry
-from reffusion.depth.background_depth import CompletionSettings, ViewDepth
-from reffusion.depth.estimates import align_estimate
-from reffusion.distill.depth_estimator import DepthEstimator
+from reffusion.distill import depth_estimator
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
 from reffusion.distill.loop import distill
 from reffusion.distill.terms.term import TermInputs
@@ -120,27 +115,6 @@ def show_truth(view: TrainView, truth: Tensor, method: str) -> TrainView:
         return replace(view, lifted=picture)
     nothing = torch.zeros_like(view.repaint)
     return replace(view, photo=picture, supervises=~nothing, repaint=nothing, clean=True)
-
-
-def make_depth_estimator(scene: Path, views: Sequence[TrainView], truth: Sequence[Tensor], seed: int) -> DepthEstimator:
-    """Return an estimator of depth that errs as a network does, in each view differently.
-
-    Args:
-        truth: of the views, as of `load_truth`.
-        seed: of errors and alignment.
-    """
-    how, guides, estimates = CompletionSettings(robust=False, seed=seed), {}, {}
-    for view, picture in zip(views, truth, strict=True):
-        name, hole = view.camera.name, view.repaint.numpy()
-        guides[name] = (picture.permute(1, 2, 0).numpy() + 1) / 2
-        if hole.any():
-            depth, draw = np.load(scene / "truth" / "depth" / f"{name}.npy"), randomness(seed, f"network {name}")
-            estimates[name] = estimate_disparity(depth, hole, KINDS["mono"].depth_error, draw).astype(np.float64)
-
-    def disparity(view: ViewDepth, _: object) -> np.ndarray:
-        return align_estimate(view, guides[view.camera.name], estimates[view.camera.name], how)[0]
-
-    return DepthEstimator(how, disparity)
 
 
 def measure_displacement(run: Path, scene: Path, size: int) -> float:
@@ -263,7 +237,7 @@ def measure_scene(
             if method in TRUE_VIEWS:
                 views = [show_truth(view, each, method) for view, each in zip(views, exact.truth, strict=True)]
                 params = params.changed(TRUE_VIEWS[method])
-            estimator = make_depth_estimator(scene, views, exact.truth, params.seed)
+            estimator = depth_estimator.build_estimator(params, space.scene.points) if params.depth.weight else None
             adapted = None if method == "no_personalization" else part("personalize") if embedded else None
             prior, text = load_adapted_prior(params, adapted) if embedded else (exact.prior, exact.text)
             inputs = TermInputs(views, references, gaussians.means[masked], prior, text, estimator, None)
