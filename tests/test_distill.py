@@ -293,6 +293,15 @@ def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path)
         assert logged == [degrees == 35] * len(logged)
 
 
+def test_the_logged_gradient_is_that_of_sds_alone(prior, text, tmp_path):
+    logged = {}
+    for name, others in (("alone", {"adversarial": OFF, "reference": OFF}), ("beside others", {})):
+        settings = with_changes(SETTINGS, iterations=1, confined=False, **others)
+        run_distill(tmp_path / name, prior, text, settings, [train_view("a")])
+        logged[name] = read_trace(tmp_path / name / "trace.jsonl")[-1]["sds_gradient_mean"]
+    assert logged["alone"] == pytest.approx(logged["beside others"])
+
+
 def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):
     """With `reaches="shown"`, a Gaussian moves only if it contributes to a pixel outside the hole."""
     start, masked = random_wall()
