@@ -221,7 +221,8 @@ def _filtered(field, channels):
     padded = np.zeros(n + 2 * RADIUS * channels, np.float32)
     out = np.empty((height, n), np.float32)
     for i in range(height):
-        padded[RADIUS * channels : RADIUS * channels + n] = field[i]
+        for j in range(n):
+            padded[RADIUS * channels + j] = field[i, j]
         _along_row(padded, rows[i + RADIUS], n, channels)
     for i in range(height):
         _down_column(rows, i, out[i], n)

@@ -54,7 +54,8 @@ def _cache_folder() -> Path:
 def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
     """Return `function` as a numba kernel that runs without the GIL.
 
-    It is compiled at the first call; later processes load the machine code from disk.
+    It is compiled at the first call; later processes load the machine code from disk. Assigning an array to a slice of
+    another takes two seconds to compile, since numba compiles the error message, too; a loop does not.
 
     Args:
         function: the function to compile.

@@ -78,7 +78,8 @@ def vote(todo, matches, hole, trust, sources, spread, voted):
                     total[c] += w * sample_cubic(sources.values, matches.source[m], y, x, c)
                 mass += w
         if mass > 0:
-            voted[hole.row[n], hole.column[n]] = total / mass
+            for c in range(channels):
+                voted[hole.row[n], hole.column[n], c] = total[c] / mass
 
 
 @kernel
