@@ -34,7 +34,7 @@ def irradiance(faces, light, face, u, v, out):
         out[ch] = top * (1 - fy) + (light[n + columns, ch] * (1 - fx) + light[n + columns + 1, ch] * fx) * fy
 
 
-@kernel(parallel=True)
+@kernel()
 def light_nodes(solids, faces):
     """Return the M nodes of the light map.
 
@@ -47,7 +47,7 @@ def light_nodes(solids, faces):
     for f in range(faces.grid.shape[0]):
         total += faces.grid[f, 1] * faces.grid[f, 2]
     points, normals, owner = np.empty((total, 3)), np.empty((total, 3)), np.empty(total, np.int32)
-    for i in prange(solids.kind.shape[0]):
+    for i in range(solids.kind.shape[0]):
         end = solids.first_face[i + 1] if i + 1 < solids.kind.shape[0] else faces.grid.shape[0]
         for f in range(solids.first_face[i], end):
             start, columns, rows = faces.grid[f, 0], faces.grid[f, 1], faces.grid[f, 2]

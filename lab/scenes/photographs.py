@@ -228,7 +228,7 @@ def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
 
 def pixel_centers(mask: np.ndarray) -> np.ndarray:
     """Return the image points (x, y) of the centers of a mask's P True pixels, [P, 2]."""
-    return np.argwhere(mask)[:, ::-1] + 0.5
+    return np.ascontiguousarray(np.argwhere(mask)[:, ::-1] + 0.5)
 
 
 def never_seen(world: World, camera, mask, train_cameras, train_masks) -> np.ndarray:

@@ -126,7 +126,7 @@ def render(solids, faces, textures, light, camera, width, height, with_object, s
     wide = (width + TILE - 1) // TILE
     for tile in prange(wide * ((height + TILE - 1) // TILE)):
         left, top, scratch = tile % wide * TILE, tile // wide * TILE, np.empty((2, 3))
-        listed = np.empty(solids.kind.shape[0], np.int32)
+        listed = np.empty(solids.kind.shape[0], np.int64)  # as in `nearest`: kernels are compiled for each type
         listed = listed[: _in_tile(solids, camera, left, top, listed)]
         for row in range(top, min(top + TILE, height)):
             for column in range(left, min(left + TILE, width)):
