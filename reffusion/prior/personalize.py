@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from math import cos, inf, isfinite, pi
 from pathlib import Path
@@ -43,7 +44,6 @@ def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> 
     return 0.5 * (1 + cos(pi * (step - warm_up) / max(steps - warm_up, 1)))
 
 
-@torch_on_one_thread()
 def personalize(
     prior: Prior,
     trained: dict[str, list[torch.nn.Parameter]],
@@ -93,21 +93,23 @@ def personalize(
             log.log(step, **errors, **({"reason": reason} if reason else {}))
         return error, is_settled
 
-    for step in trace.progress(steps, "personalize", start):
-        if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
-            error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
-            if is_settled:
-                break
-        factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * factor
-        train_step(prior, optimizer, references, settings, step)
-        if checkpoints.due:
-            progress_state = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
-            progress_state |= {"error": error}
-            checkpoints.save(lambda progress_state=progress_state: progress_state | {"lora": lora.state(prior)})
-    else:
-        measure(steps)
+    # The embedded prior's tensors are so small that a second thread delays.
+    with torch_on_one_thread() if prior.device.type == "cpu" else nullcontext():
+        for step in trace.progress(steps, "personalize", start):
+            if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
+                error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
+                if is_settled:
+                    break
+            factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+            train_step(prior, optimizer, references, settings, step)
+            if checkpoints.due:
+                progress_state = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
+                progress_state |= {"error": error}
+                checkpoints.save(lambda progress_state=progress_state: progress_state | {"lora": lora.state(prior)})
+        else:
+            measure(steps)
     lora.set_dropout(prior, False)
 
 
