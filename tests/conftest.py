@@ -52,12 +52,3 @@ def wall_folders(tmp_path):
     from scenes.references import write_wall_stages
 
     return write_wall_stages(tmp_path)
-
-
-def pytest_collection_modifyitems(items):
-    """Start with one file that renders and two that do not, so that one process alone compiles the kernels.
-
-    Three processes (`make test`) would otherwise compile the same kernels at the same time.
-    """
-    first = ("test_app.py", "test_batch.py", "test_runner.py")
-    items.sort(key=lambda item: item.path.name not in first)

@@ -266,7 +266,7 @@ def _spread(
             total = _bilateral_weights(color, row, column, spacing, weights)
             # The first iteration computes the costs of the initial planes.
             if first:
-                _copy(planes[row, column], plane)
+                _copy_plane(planes[row, column], plane)
                 cost[row, column] = _plane_cost(*views, row, column, plane, spacing, weights, total)
             # The candidates are the planes of eight neighbors and two random changes of the own plane.
             for candidate in range(_CANDIDATES):
@@ -274,17 +274,18 @@ def _spread(
                     y, x = row + spacing * _NEIGHBORS[candidate, 0], column + spacing * _NEIGHBORS[candidate, 1]
                     if y < 0 or y >= height or x < 0 or x >= width:
                         continue
-                    _copy(planes[y, x], plane)
+                    _copy_plane(planes[y, x], plane)
                 else:
                     _perturb(planes[row, column], rays[row, column], noise[row, column], change_size, candidate, plane)
                 new_cost = _plane_cost(*views, row, column, plane, spacing, weights, total)
                 if new_cost < cost[row, column]:
                     cost[row, column] = new_cost
-                    _copy(plane, planes[row, column])
+                    _copy_plane(plane, planes[row, column])
 
 
 @kernel
-def _copy(plane, target):
+def _copy_plane(plane, target):
+    """Copy the three numbers of a plane; assigning the array to a slice takes seconds to compile."""
     for k in range(3):
         target[k] = plane[k]
 
