@@ -467,7 +467,7 @@ def test_shown_progress_never_runs_back_and_its_end_stays():
     assert shown.update(80, "masks", None, 20) == {"share": None, "left": 20, "whole": 0.8}
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width):
     shutil.copytree(mini_scene, tmp_path / "mini")

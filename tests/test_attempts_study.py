@@ -1,6 +1,5 @@
 """The study of settings of `distill`: each attempt is a valid setting; the scores equal those of the stage's output."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,8 @@ from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from stages import distill
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
-slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute; set REFFUSION_SLOW=1")
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -49,7 +47,6 @@ def test_every_attempt_is_a_setting_of_distill(name):
         assert params != benchmark.profile_params({})
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a study, 20 seconds; set REFFUSION_SLOW=1")
 def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(initialized_run, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "MEASURED_STEPS", (0, 4))
     views = benchmark.load_test_views(initialized_run)
@@ -62,7 +59,6 @@ def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(init
         assert {name: line[name] for name in benchmark.SCORES} == pytest.approx(expected, rel=1e-4)
 
 
-@slow
 def test_scores_are_those_of_the_box(initialized_run):
     gaussians = load_ply(initialized_run / "initialize" / "gaussians.ply")
     camera, truth, box = benchmark.load_test_views(initialized_run)[0]
@@ -73,7 +69,6 @@ def test_scores_are_those_of_the_box(initialized_run):
     assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})
 
 
-@slow
 def test_a_scene_without_ground_truth_is_refused(initialized_run, tmp_path):
     poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     with pytest.raises(ValueError, match="take another scene"):

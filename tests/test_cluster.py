@@ -29,7 +29,6 @@ from runner.worker import INTERRUPTED
 pytestmark = pytest.mark.integration
 
 REPO = Path(__file__).resolve().parent.parent
-slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
 
 def artifact_hashes(runs: Path) -> dict[str, str]:
@@ -150,7 +149,7 @@ def write_twelve_scenes(root: Path) -> Path:
     return root
 
 
-@slow
+@pytest.mark.slow
 def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, ray_engine, ray_cluster):
     """Results are equal even though one Ray node is killed while stages run on it."""
     root = write_twelve_scenes(tmp_path)
@@ -205,7 +204,7 @@ sys.exit(batch(make_request(root, "", cuda=engine.cuda), root / "many", Executio
 """
 
 
-@slow
+@pytest.mark.slow
 @pytest.mark.parametrize("send", [signal.SIGKILL, signal.SIGINT])
 def test_the_driver_killed_and_started_again(tmp_path, ray_cluster, send):
     root = write_projects(tmp_path, 5.0)
@@ -226,7 +225,7 @@ def test_the_driver_killed_and_started_again(tmp_path, ray_cluster, send):
     assert_artifacts_complete(root / "runs")
 
 
-@slow
+@pytest.mark.slow
 @pytest.mark.parametrize("last", ["poses", "distill", "evaluate"])
 def test_work_finished_when_the_driver_is_interrupted_is_not_repeated(tmp_path, ray_cluster, last):
     root = write_projects(tmp_path)
@@ -244,7 +243,7 @@ def test_work_finished_when_the_driver_is_interrupted_is_not_repeated(tmp_path, 
     assert_artifacts_complete(root / "runs")
 
 
-@slow
+@pytest.mark.slow
 def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, ray_engine, capsys):
     root = write_projects(tmp_path)
     run_scene(make_request(root, str(root / "many/a"), cuda=ray_engine.cuda), "poses", None, Execution(ray_engine, 1))

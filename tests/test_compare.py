@@ -175,7 +175,7 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
             page.make(home)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
     """Runs the command of `make data=FOLDER compare` at tiny sizes, kills it in the second scene, and runs it again."""
     from reffusion.capture import spinnerf_scenes

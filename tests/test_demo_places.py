@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,8 @@ import yaml
 
 from reffusion.io.images import load_mask
 
-pytestmark = pytest.mark.integration
-SEEDS = (0, 11) if os.environ.get("REFFUSION_SLOW") == "1" else (0,)
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
+SEEDS = 0, 11
 
 
 @pytest.mark.parametrize(

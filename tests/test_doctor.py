@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ from reffusion.io.images import load_image
 from report import doctor
 
 ROOT = Path(__file__).resolve().parent.parent
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes; set REFFUSION_SLOW=1")
 
 
 def test_faults_are_named_and_a_right_picture_has_none():
@@ -35,7 +33,7 @@ def test_faults_are_named_and_a_right_picture_has_none():
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("key", ["exemplar", pytest.param("embedded", marks=SLOW)])
+@pytest.mark.parametrize("key", ["exemplar", pytest.param("embedded", marks=pytest.mark.slow)])
 def test_what_a_fresh_machine_has_is_plausible(key):
     case = doctor.make_case()
     assert doctor.find_problem(key) is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -108,7 +107,7 @@ def test_a_compressed_file_that_is_cut_off_is_refused(tmp_path):
         load_ply(path)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_splat_transform_reads_both_files(tmp_path, degree):
     if not (npx := shutil.which("npx")):
@@ -198,7 +197,7 @@ def test_niantics_library_reads_spz(tmp_path):
     check_reading(tmp_path / "up.ply", made, camera, (1, -1, -1))
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_other_libraries_read_sog_and_spz(tmp_path):
     """GaussForge reads the .sog of splat-transform, which reads the .spz of gsply."""
     pytest.importorskip("gsply")
@@ -221,7 +220,7 @@ def test_other_libraries_read_sog_and_spz(tmp_path):
 
 
 @pytest.mark.integration
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_splat_transform_and_we_keep_that_splats_are_antialiased(tmp_path):
     pytest.importorskip("gsply")
     if not shutil.which("npm"):

@@ -41,7 +41,6 @@ from runner.user_yaml import read_user_yaml
 
 pytestmark = pytest.mark.integration
 
-SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))
 QUICK = 40  # corrupted files for each reader in an ordinary run
 LONGEST = 60  # s: a reader that takes longer hangs; a busy machine takes 11
@@ -367,7 +366,7 @@ def test_spoilt_files(name):
     fuzz(READERS[name], QUICK)
 
 
-@pytest.mark.skipif(not SLOW, reason="minutes a reader; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_spoilt_files_for_long(name):
     fuzz(READERS[name], None, SECONDS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import struct
 import subprocess
@@ -175,7 +174,7 @@ def test_refusals_say_what_would_help(tmp_path):
         summarize_splats(path)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 3])
 def test_what_splat_transform_writes_is_read(tmp_path, degree):
     made = random_gaussians(300, degree)

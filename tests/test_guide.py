@@ -70,7 +70,7 @@ def test_the_mask_page(photo_folder):
             os.killpg(serving.pid, signal.SIGTERM)  # not SIGINT, which a test runner may ignore and pass on
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_long_commands_run(photo_folder):
     for goal, made in (("reference", "to_paint"), ("all", "evaluate/scene.ply"), ("report", "report.html")):
         run_make(*(c for c in COMMANDS if c.endswith(goal)), photo_folder)

@@ -312,7 +312,9 @@ def test_a_depth_map_that_is_unknown_outside_the_hole_adds_nothing_there():
     hole[14:22, 16:30], unknown[:, :8] = True, True
     floor = sheet_gaussians(picture, depth, ~nothing, view, 1, SHEETS)
     reference = Reference(view, np.uint8(255 * picture), hole | unknown, np.where(unknown, np.nan, depth))
-    _, estimate, _ = rules.estimate_depth(floor, reference, hole, nothing, np.zeros((0, 3)), CompletionSettings())
+    _, estimate, _ = rules.estimate_depth(
+        rasterizer.render(floor, reference.camera), reference, hole, nothing, np.zeros((0, 3)), CompletionSettings()
+    )
     np.testing.assert_allclose(estimate, depth, rtol=0.02)
     assert not coverage.pixels_in_front(floor, estimate, reference, nothing).any()
 

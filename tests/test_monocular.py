@@ -14,6 +14,7 @@ from reffusion.depth import monocular
 from reffusion.depth.background_depth import CompletionSettings, ViewDepth
 from reffusion.initialize import unprojection
 from reffusion.seeding import generator
+from reffusion.splat import rasterizer
 from reffusion.types import Reference
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
@@ -105,8 +106,9 @@ def test_the_references_depth_is_the_estimate_aligned():
     means *= 1 / (1 - 0.2 * means[:, 1:2] / wall_scene.WALL)
     height = (np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] + 0.5 - wall_scene.HEIGHT / 2) / wall_scene.FOCAL
     true = (1 - 0.2 * height) / wall_scene.WALL
+    tilted = rasterizer.render(replace(remaining, means=means), reference.camera)
     behind_it = lambda estimate: unprojection.estimate_depth(
-        replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), CompletionSettings(), estimate
+        tilted, reference, hole, hole, np.zeros((0, 3)), CompletionSettings(), estimate
     )
     _, made_up, message = behind_it(50 * true - 3)
     assert "aligned" in message

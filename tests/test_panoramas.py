@@ -1,6 +1,5 @@
 """Panoramas are cut into the views that cameras would take at their centers, and placed as rigs."""
 
-import os
 from itertools import pairwise
 
 import numpy as np
@@ -66,7 +65,7 @@ def test_cut_views_are_those_of_cameras_at_the_center(textures):
         assert psnr(found / 255, true / 255, everywhere) > psnr(shifted / 255, true / 255, everywhere) + 4, direction
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_cut_panoramas_are_a_capture_with_true_poses(textures, tmp_path):
     generator = np.random.default_rng(1)
     declared = PngInfo()

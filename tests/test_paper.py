@@ -162,7 +162,7 @@ def row_errors(name, row, profile_values):
         name in FIXED and is_same(stated[0], FIXED[name]),
         name in ABSENT and is_same(stated[0], ABSENT[name]),
     )
-    kinds = {"=": fixed, "no": absent, "open": name not in FIXED | ABSENT}
+    kinds = {"=": fixed, "no": absent, "open": name not in FIXED | ABSENT | OTHERWISE}
     return (
         []
         if kinds.get(says, OTHERWISE.get(name) == says)
@@ -211,6 +211,8 @@ def test_a_changed_value_is_found_wherever_it_stands(profile_values):
             changed = (*stated[:k], another_value(stated[k]), *stated[k + 1 :])
             assert row_errors(name, (says, changed), profile_values), f"{name} of {profile} in the table"
             assert row_errors(name, (says, stated), with_other(profile)), f"{name} of {profile} in pipeline.yaml"
+        if name in OTHERWISE:
+            assert row_errors(name, ("open", stated), profile_values), name
         if says in ("=", "no"):  # if table and profile change alike, FIXED and ABSENT above find it
             assert row_errors(name, (says, (another_value(stated[0]), *stated[1:])), with_other("paper")), name
     left_out = [name for name, (says, _) in table.items() if says != "open"]
@@ -238,14 +240,18 @@ def test_constants_of_the_library():
     import torch
 
     from lab.gpu import random_priors
+    from reffusion.distill import densification
+    from reffusion.fit import step
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.metrics import image_metrics
-    from reffusion.params.base import Prompts
-    from reffusion.prior import lora
+    from reffusion.params.base import REFINED_FROM, Prompts
+    from reffusion.prior import crops, lora
 
     assert Prompts().texts == ["A photo of sks", "A photo of sks, cropped", ""]
     assert image_metrics.BOX_DILATION == 0.1
     assert 8 * random_priors.SD2.unet["sample_size"] == 512
+    assert densification.GROW_SCALE3D == step.GROW_SCALE3D == 0.01
+    assert crops.MAX_BORDER == 0.1 and REFINED_FROM == 0.6
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}
     # The loss is 0.8 L1 + 0.2 (1 - SSIM). A black and a white picture have an L1 of 1 and an SSIM of almost 0.

@@ -229,8 +229,10 @@ def test_without_personalization_the_lora_is_missing_and_the_prompts_are_plain_w
 
 def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
-    _, embeddings = inputs.load_adapted_prior(Params(), None)
-    assert torch.equal(embeddings, diffusion.embed_text(prior, Prompts().texts))
+    for prompts in (Prompts(), Prompts(whole="a wall", crop="a brick")):
+        _, embeddings = inputs.load_adapted_prior(Params(prompts=prompts), None)
+        assert torch.equal(embeddings, diffusion.embed_text(prior, prompts.texts))
+    assert not torch.equal(embeddings, diffusion.embed_text(prior, Prompts().texts))
 
 
 def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, monkeypatch):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -241,7 +240,7 @@ def test_cameras_of_an_open_room_stand_in_it(walls):
 # ---------------------------------------------------------------------------------------------- the whole command
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_the_command_fills_a_hole_and_goes_on(tmp_path):
     means, deleted = sample_room("back")
     count = len(means)

@@ -5,7 +5,6 @@ They are SDXL, batches that are processed in parts, half precision, memory budge
 
 import gc
 import json
-import os
 import sys
 import weakref
 from dataclasses import replace
@@ -330,7 +329,7 @@ def test_the_full_size_benchmark_at_a_small_size(tmp_path, monkeypatch, dtype):
     assert report["epsilon difference"] < (1e-5 if dtype == "float32" else 0.05 * report["epsilon size"])
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes a minute; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
     """The benchmark runs at a small size on the CPU, and its part with the critic runs out of memory.
 

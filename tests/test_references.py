@@ -5,7 +5,6 @@ Tested are registration, depth maps, refusals, the stage `reference`, and which 
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -520,7 +519,7 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute")
+@pytest.mark.slow
 def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
     folder = write_wall_capture(tmp_path / "wall")
     masks = {path: path.read_bytes() for path in (folder / "masks").iterdir()}

@@ -24,10 +24,7 @@ from runner.keys import Hashes
 from runner.plan import decide
 from runner.resolve import Request, resolve
 
-pytestmark = [
-    pytest.mark.integration,
-    pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes"),
-]
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))

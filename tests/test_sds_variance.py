@@ -1,6 +1,5 @@
 """The benchmark of the variance of the SDS gradient, on samples of known variance and on a small run."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,7 @@ def test_without_noise_and_without_a_pull_nothing_is_left():
     assert found["pull"] == pytest.approx([0.49] * 3)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute")
+@pytest.mark.slow
 def test_on_a_scene_without_ground_truth(tmp_path):
     prior, hole = small_prior(), np.zeros((36, 48), bool)
     hole[10:24, 12:30] = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -31,7 +30,6 @@ from stages import poses
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[1]
-slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
 
 def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
@@ -193,7 +191,7 @@ def test_focal_length_from_exif(tmp_path, ending):
     assert sorted(file.name for file in tmp_path.iterdir()) == [path.name]
 
 
-@slow
+@pytest.mark.slow
 def test_demo_photos(tmp_path):
     """All photographs of the generated demo scene are placed at their true poses."""
     made = [sys.executable, "-m", "lab.scenes.generate", "--out", str(tmp_path / "s"), "--kind", "photos"]
@@ -205,7 +203,7 @@ def test_demo_photos(tmp_path):
     assert_accepted(scene, truth)
 
 
-@slow
+@pytest.mark.slow
 def test_bear(tmp_path):
     """A dozen neighboring photographs get the capture's poses, which COLMAP estimated from 96 photographs."""
     capture = load_capture(real_capture("bear"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import struct
@@ -396,7 +395,7 @@ def test_points_of_a_cloud_are_not_touched(tmp_path):
     assert len(load_points(tmp_path / "p.ply")[0]) == 3
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_splat_transform_and_we_read_the_same(tmp_path):
     if not (npx := shutil.which("npx")):
         pytest.skip("there is no npm")
@@ -430,7 +429,7 @@ def test_splat_transform_and_we_read_the_same(tmp_path):
         np.testing.assert_allclose(read.sh[nearest][:, :harmonics], made.sh[:, :harmonics], atol=0.07, err_msg=name)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["theirs.sog", "meta.json"])
 def test_sog_is_read_by_splat_transform(tmp_path, name):
     made = random_gaussians(300, 2)
@@ -458,7 +457,7 @@ def test_sog_is_read_by_splat_transform(tmp_path, name):
             summarize_splats(tmp_path / name)
 
 
-@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.slow
 def test_a_damaged_ksplat_is_refused_in_one_line(tmp_path):
     (tmp_path / "s.ksplat").write_bytes(bytes(4096))
     if not shutil.which("npm"):

@@ -14,7 +14,6 @@ import pytest
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).resolve().parent.parent
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute; set REFFUSION_SLOW=1")
 TARGETS = {"x86-64": ("x86-64", "+sse2"), "avx2": ("haswell", "+avx,+avx2,+fma,+bmi,+bmi2,+f16c,+popcnt,+sse4.2")}
 CHECK = """
 import sys
@@ -35,7 +34,7 @@ print("ymm", "ymm" in assembly, "fma", "vfmadd" in assembly, "zmm", "zmm" in ass
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="needs an x86-64 processor")
-@pytest.mark.parametrize("target", [pytest.param(name, marks=SLOW) for name in ("x86-64", "avx2")])
+@pytest.mark.parametrize("target", [pytest.param(name, marks=pytest.mark.slow) for name in ("x86-64", "avx2")])
 def test_other_processors(target, tmp_path):
     """Values and gradients equal the reference, and the machine code uses the target's instruction set."""
     have = llvmlite.binding.get_host_cpu_features()

@@ -130,7 +130,7 @@ def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
     true, hidden, vase = render_vase(view.camera)
     supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).plausible_depth) & vase
     inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
-    found = find_unobserved(gaussians, view.camera, hidden, views, planes, mirrors)
+    found = find_unobserved(rasterizer.render(gaussians, view.camera), view.camera, hidden, views, planes, mirrors)
     inside &= found.depth > 1.05 * true  # without the ground behind the vase, which other views show
     assert inside.sum() > 200 and found.unobserved[inside].mean() > 0.9
     assert np.median(np.abs(found.continued_depth / true - 1)[inside & found.unobserved]) < 0.01

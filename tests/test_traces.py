@@ -2,7 +2,6 @@
 
 import copy
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -166,7 +165,6 @@ def test_moments_depend_on_the_iteration_only():
     assert [i for i in range(41) if trace.log_spaced(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
 
 
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="see test_personalize; REFFUSION_SLOW=1")
 KILLED = {
     "fit": (fitting, "step", 6),
     "personalize": (personalizing, "train_step", 4),
@@ -214,7 +212,7 @@ def test_a_slow_disk_does_not_hold_a_stage_up(initialized_folders, tmp_path, mon
     assert len(saved) == 1
 
 
-@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=SLOW), "distill"])
+@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=pytest.mark.slow), "distill"])
 def test_a_stage_gives_the_same_after_a_kill(initialized_folders, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     module, name, position = KILLED[stage]
@@ -293,10 +291,7 @@ def test_steps_that_fit_are_counted_once(tmp_path):
     assert not any(folder.exists() for folder in tried)
 
 
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute")
-
-
-@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=SLOW), "distill"])
+@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=pytest.mark.slow), "distill"])
 def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_path, stage):
     """A budget of 1 ms gives the smallest number of steps, a twentieth. The trial run must not change the result."""
     steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]

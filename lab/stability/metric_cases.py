@@ -16,6 +16,7 @@ from reffusion.gaussians.ssim import C1
 from reffusion.masks import voting
 from reffusion.metrics import image_metrics
 from reffusion.metrics.lpips import Lpips
+from reffusion.splat.rasterizer import render
 
 VIEWS = [camera(12, 10), camera(12, 10, 1.2), camera(12, 10, 1.5)]
 NAMED = [type(view)(f"v{k}", *list(vars(view).values())[1:8]) for k, view in enumerate(VIEWS)]  # with unequal names
@@ -203,7 +204,7 @@ def empty_scene_errors() -> float:
     nobody = cloud().map(lambda p: p[:0])
     views = visibility.render_depth_views(nobody, NAMED, {view.name: FULL for view in NAMED})
     planes = continuation.find_planes(np.zeros(3), 1.0, views, np.zeros((0, 3)))
-    pixels = unobserved.find_unobserved(nobody, NAMED[0], FULL, views, planes)
+    pixels = unobserved.find_unobserved(render(nobody, NAMED[0]), NAMED[0], FULL, views, planes)
     counts = visibility.count_views(np.zeros((1, 3)), views)
     return float(
         (~pixels.unobserved).sum() + np.isfinite(pixels.continued_depth).sum() + counts.seen.sum() + counts.free.sum()

@@ -25,8 +25,7 @@ from reffusion.background.visibility import (
     smooth_surface,
     with_photographed_depth,
 )
-from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Camera, Rendering
 
 RING = 0.03  # of the image's width: distance from a patch of a plane up to which the plane is compared with the depth
 # Relative depth by which a pixel on a plane may differ from the plane. At a depth edge the depth range around a pixel
@@ -64,7 +63,7 @@ class HoleGeometry:
 
 @torch.no_grad()
 def find_unobserved(
-    remaining: Gaussians,
+    rendering: Rendering,
     camera: Camera,
     mask: np.ndarray,
     views: Sequence[DepthView],
@@ -73,20 +72,19 @@ def find_unobserved(
 ) -> HoleGeometry:
     """Split the pixels of C, the mask of the object in a view, into observed and unobserved pixels.
 
-    The remaining Gaussians are rendered, and each pixel of C is unprojected to a point of the background. A view shows
+    Each pixel of C is unprojected to a point of the background. A view shows
     the point if it sees the point outside its mask, at the same depth and from the same side. The pixel is observed if
     at least a quarter of the views that could see the point show it (`Visibility.is_observed`), and if no plane or
     mirror image continues in front of the point. The quarter excludes Gaussians that most views place below a surface;
     these are fitting artifacts. Pixels where the remaining Gaussians are not opaque are unobserved.
 
     Args:
-        remaining: the M Gaussians without the object.
+        rendering: the remaining Gaussians, rendered in the view.
         camera: the view.
         mask: bool [H, W], C of the view.
         views: depth of the training views, rendered with the object.
         planes, mirrors: planes and symmetric things around the object, see `background.model`.
     """
-    rendering = rasterizer.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
     rows, columns = np.nonzero(mask & (alpha > OPAQUE))
     unobserved, confirmed = mask.copy(), np.zeros_like(mask)

@@ -165,7 +165,7 @@ def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
 def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
     """Return the loss that the generator minimises.
 
-    PAPER leaves open: which form. "saturating", mean f(-D(fake)), is the critic's own objective, whose gradient
+    The paper prints "saturating", mean f(-D(fake)): it is the critic's own objective, whose gradient
     vanishes where the critic is certain that a patch is fake. "non-saturating", -mean f(D(fake)), has the same fixed
     point, and its gradient is largest there.
 

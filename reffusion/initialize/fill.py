@@ -23,7 +23,7 @@ from reffusion.morphology import dilate_by_distance
 from reffusion.params.initialize import Params
 from reffusion.splat import rasterizer
 from reffusion.trace import Trace
-from reffusion.types import Camera, Gaussians, Reference
+from reffusion.types import Camera, Reference, Rendering
 
 STEPS_MARGIN = 0.006  # of the image's width: how far beyond the hole ramps of the depth are sharpened to steps
 COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
@@ -173,9 +173,10 @@ def estimate_surface(
     # The plane sweep cannot measure depth at the rim of a gap as narrow as this.
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
-    hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep) if params.depth.hints else NO_HINTS
+    rendering = rasterizer.render(draft.remaining, camera, sh_degree=0)
+    hints = _gather_hints(rendering, camera, near, swept, params.depth.sweep) if params.depth.hints else NO_HINTS
     # The gap of an extra view lies among new surfaces too; a reference must not continue what an earlier one invented.
-    surroundings = draft.gaussians if farthest else draft.remaining
+    surroundings = rasterizer.render(draft.gaussians, camera, sh_degree=0) if farthest else rendering
     depth, estimate, words = unprojection.estimate_depth(
         surroundings, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
@@ -229,13 +230,13 @@ def insert_object(
 
 
 def _gather_hints(
-    remaining: Gaussians, camera: Camera, background: Background, swept: np.ndarray | None, use_free_space: bool
+    rendering: Rendering, camera: Camera, background: Background, swept: np.ndarray | None, use_free_space: bool
 ) -> Hints:
     """Return what planes, mirror images and other views tell about the depth in the hole of a view."""
     uncovered = find_unobserved(
-        remaining, camera, background.masks[camera.name], background.views, background.planes, background.mirrors
+        rendering, camera, background.masks[camera.name], background.views, background.planes, background.mirrors
     )
-    # `remaining` has neither the removed nor new Gaussians. `swept`, bool [H, W] or None, marks depth found by a plane
+    # `rendering` shows neither removed nor new Gaussians. `swept`, bool [H, W] or None, marks depth found by a plane
     # sweep. With `use_free_space`, continued surfaces that other views see past are rejected.
     return Hints(
         plane_depth=uncovered.continued_depth,

@@ -24,7 +24,7 @@ from reffusion.initialize.view_dependent_color import measure_change, transfer_s
 from reffusion.morphology import square
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
-from reffusion.types import Camera, Gaussians, Reference
+from reffusion.types import Camera, Gaussians, Reference, Rendering
 
 COLOR_WINDOW_PX = 2  # px: radius of the window whose darkest and brightest colors bound a Gaussian's color
 COLOR_MARGIN = 0.1  # colors in [0, 1]: how far beyond these bounds a Gaussian's color may lie
@@ -32,7 +32,7 @@ COLOR_MARGIN = 0.1  # colors in [0, 1]: how far beyond these bounds a Gaussian's
 
 @torch.no_grad()
 def estimate_depth(
-    gaussians: Gaussians,
+    rendering: Rendering,
     reference: Reference,
     hole: np.ndarray,
     mask: np.ndarray,
@@ -50,7 +50,7 @@ def estimate_depth(
     the hole.
 
     Args:
-        gaussians: the scene without the object, whose depth is continued.
+        rendering: the view of the scene without the object, whose depth is continued.
         reference: the completed view.
         hole: bool [H, W], the pixels to fill.
         mask: bool [H, W], C of the view (the object's pixels).
@@ -73,7 +73,6 @@ def estimate_depth(
         ValueError: too little depth is known around the hole, or the depth map or the model's output does not fit the
             scene. The message names the view.
     """
-    rendering = rasterizer.render(gaussians, reference.camera, sh_degree=0)
     view = background_depth.extract_depth(rendering, reference.camera, hole, mask, completion, hints)
     solvers = SolverLog(log, reference.camera.name, *background_depth.points_around(view, points, completion))
     try:

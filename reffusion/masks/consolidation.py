@@ -26,6 +26,7 @@ from reffusion.masks import regions, voting
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.voting import Votes
 from reffusion.params.masks import Params
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labelled by its position
@@ -154,7 +155,8 @@ def classify_pixels(
         given = raw.get(name, np.zeros_like(mask))
         if not needs_unobserved(params, fill):
             return MaskSet(given, mask, mask & is_dirty, mask & is_dirty)
-        found = find_unobserved(remaining, camera, mask, background.views, background.planes, background.mirrors)
+        rendering = rasterizer.render(remaining, camera, sh_degree=0)
+        found = find_unobserved(rendering, camera, mask, background.views, background.planes, background.mirrors)
         unobserved = clean_mask(params, found.unobserved) & mask & is_dirty
         invent = mask & is_dirty if params.invent == "consistent" else unobserved
         invent = invent | fill.render(camera, found.depth)

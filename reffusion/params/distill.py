@@ -92,11 +92,11 @@ class AdversarialTerm(Settings):
     width: int = Field(
         256, ge=1, description="the critic's channels at that side; doubled with each halving, up to 512"
     )
-    # PAPER leaves open: the form. It prints a min-max problem, as GANeRF does, and says that it follows GANeRF, whose
-    # code has the non-saturating form. The gradient of the saturating form vanishes where the critic is certain.
+    # Not as printed: the paper prints the saturating form and says that it follows GANeRF, whose code has the
+    # non-saturating form. The gradient of the saturating form vanishes where the critic is certain.
     form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="form of the generator's loss")
-    # PAPER leaves open: the weight, which is GANeRF's, and the patches. The paper prints fake patches; GANeRF's code
-    # takes real ones, for which R1 is defined.
+    # PAPER leaves open: the weight, which is GANeRF's. The paper prints fake patches; GANeRF's code takes real ones,
+    # for which R1 is defined.
     penalty: float = Field(0.2, ge=0, description="weight of half the squared gradient norm of the critic (R1)")
     penalized: Literal["real", "fake"] = Field("real", description="the patches at which that gradient is taken")
 
