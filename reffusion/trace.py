@@ -104,7 +104,7 @@ class Trace:
     """A writer of `trace.jsonl`, the error over time of a stage, one line per measurement.
 
     docs/development.md#traces describes the lines. The time in the lines is the time of work since the stage began. It
-    excludes the time spent inside `with trace.paused():` and between an interruption and the resumed run.
+    excludes the time spent inside `with trace.pause():` and between an interruption and the resumed run.
 
     Args:
         folder: the folder of the file.
@@ -128,7 +128,7 @@ class Trace:
         return self._offset + (0.0 if self._is_paused else time.perf_counter() - self._since)
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def pause(self) -> Iterator[None]:
         """Exclude the time inside the `with` block from the trace, e.g. for a measurement. Blocks may be nested."""
         was_standing = self._is_paused
         self._offset, self._is_paused = self.seconds, True
@@ -152,7 +152,7 @@ class Trace:
         for name, value in errors.items():
             if not isinstance(value, str) and not isfinite(value):
                 raise FloatingPointError(f"step {iteration}: {name} is {value}")
-        with self.paused():
+        with self.pause():
             record = {"seconds": round(self.seconds, 4), "iteration": iteration, **errors}
             with open(self.path, "a") as file:
                 file.write(json.dumps(record) + "\n")
@@ -163,7 +163,7 @@ def decibels(squared_error: float) -> float:
     return -10 * log10(max(squared_error, 1e-10))
 
 
-def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
+def is_log_step(iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
     """Return whether to measure at this iteration, so that measurements are evenly spaced on a logarithmic scale.
 
     Args:

@@ -106,7 +106,7 @@ class Workspace:
         Returns:
             View name -> uint8 [H, W, 3]. A view without a photograph gets a rendering of the Gaussians with the object.
         """
-        photos = exposure.load_normalized_views(self.poses, self.fit, list(names))
+        photos = exposure.load_photos_in_scene_exposure(self.poses, self.fit, list(names))
         if shadow := self.shadow:
             for name in photos.keys() - self.scene.clean:
                 view = self.depth_view(name)

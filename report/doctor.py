@@ -24,7 +24,7 @@ import torch
 from reffusion.command import root, workplace
 from reffusion.inpaint import classical, feedforward, moebius
 from reffusion.inpaint.patchmatch.completion import complete
-from reffusion.inpaint.source_image import without_geometry
+from reffusion.inpaint.source_image import flat_source
 from reffusion.io.images import save_image
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.inpainter import FEED_FORWARD, Inpainter
@@ -121,7 +121,7 @@ def _paint(key: str, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     if key == "telea":
         return classical.telea(image, hole)
     if key == "exemplar":
-        source = without_geometry(image, hole)
+        source = flat_source(image, hole)
         return complete(source, hole, [source]).image
     if key in FEED_FORWARD:
         painter = feedforward.load_inpainter(Inpainter(kind=key))

@@ -21,13 +21,13 @@ from reffusion.capture.click_coordinates import distort_mask, distort_points, un
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
 from reffusion.capture.undistort import load_undistorted_mask
-from reffusion.clicks.color_evidence import spread_evenly
+from reffusion.clicks.color_evidence import sample_evenly
 from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import MAX_NETWORK_VIEWS, FittedViews
 from reffusion.clicks.marks import SIZES, Mark
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
 from reffusion.clicks.scene_segmentation import (
-    Settled,
+    SavedMasks,
     correct_own_view,
     segment_first,
     segment_own_view,
@@ -166,7 +166,7 @@ class Session:
             if saved["view"] in self.images and saved["view"] not in capture.given:
                 self.events.append(self._from_photograph(saved))
         complete = {*self.views} <= {*self.masks}
-        self.settled = Settled(self.events, self.masks) if self.events and complete else None
+        self.settled = SavedMasks(self.events, self.masks) if self.events and complete else None
         self.saved = self._keys(), complete  # the marks of the saved masks; whether these are the masks of all views
         threading.Thread(target=self._update_masks, daemon=True).start()
         if segmenter is not None:
@@ -396,7 +396,7 @@ class Session:
     def _encode_all(self) -> None:
         """Encode the views for the segmentation network in a background thread, before the user marks any."""
         # This runs while the scene is being fitted.
-        for name in spread_evenly(sorted(self.views), MAX_NETWORK_VIEWS):
+        for name in sample_evenly(sorted(self.views), MAX_NETWORK_VIEWS):
             self.features_of(name)
 
     def _load_evidence(self, name: str) -> ViewEvidence:
@@ -482,7 +482,7 @@ class Session:
             masks = segment_scene(views, events, given, self._recall, settled)
         self._show(masks, revision)
 
-    def _settled_part(self, events: Sequence[Event]) -> Settled | None:
+    def _settled_part(self, events: Sequence[Event]) -> SavedMasks | None:
         """Return the saved masks if the marks of these are the first of `events`, else None."""
         settled = self.settled
         if settled is None or [event.key for event in settled.events] != [e.key for e in events[: len(settled.events)]]:

@@ -16,6 +16,7 @@ from reffusion.command import root, scene_path
 
 
 def main() -> None:
+    """Run `reffusion panoramas`: cut panoramas into views, and print what was written."""
     parser = argparse.ArgumentParser(prog="reffusion panoramas", description=__doc__.split("\n")[0])
     parser.add_argument("scene", help="folder of panoramas, or a video of them; the name or path of a scene")
     parser.add_argument("--out", type=Path, help="folder to write; otherwise that of the scene, with -views at its end")

@@ -238,6 +238,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
+    """Run `reffusion view`: serve the viewer of one scene until Ctrl-C, and print its address."""
     parser = cli.scene_parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()

@@ -142,7 +142,7 @@ def delete_folder(folder: Path) -> None:
         shutil.rmtree(gone)
 
 
-def take_over(folder: Path) -> None:
+def restore_from_attempt(folder: Path) -> None:
     """Restore `folder` from the newest attempt whose runner or machine was lost, if `folder` does not exist.
 
     The attempt's folder, <folder>.<suffix>, is copied and not renamed, because the lost attempt may still write to it.

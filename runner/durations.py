@@ -24,7 +24,7 @@ MAX_RECEIPTS = 200  # receipts that are read for the speed of this machine
 PRIOR_SECONDS = 60  # the table's own weight beside the receipts, as if a machine as fast had worked for so long
 
 
-def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
+def receipts_of_variants(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
     """Return the receipts of a stage in the scene's own run and in its variants, as far as there are any."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     return [receipt for place in places if (receipt := read_receipt(place / stage))]
@@ -41,7 +41,7 @@ def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     if job.gpu:
         return typical
     alike = {"machine": MACHINE, "profile": job.profile}.items()
-    if here := [receipt for receipt in earlier_receipts(job, stage) if alike <= receipt.items()]:
+    if here := [receipt for receipt in receipts_of_variants(job, stage) if alike <= receipt.items()]:
         return max(here, key=lambda receipt: receipt["date"])["seconds"]
     return None if typical is None else typical * _slowness(job)
 
@@ -99,7 +99,7 @@ def _slowness(job: ResolvedJob) -> float:
     return seconds / typical
 
 
-def seconds_left(job: ResolvedJob, decisions: Mapping[str, Decision]) -> dict[str, float | None]:
+def seconds_by_stage(job: ResolvedJob, decisions: Mapping[str, Decision]) -> dict[str, float | None]:
     """Return the expected seconds of the stages of a plan that are still to run; None where they are unknown.
 
     If the job names another machine's GPU, these are the stages that would run there.
@@ -108,7 +108,7 @@ def seconds_left(job: ResolvedJob, decisions: Mapping[str, Decision]) -> dict[st
     return {stage: expected_seconds(job, stage) for stage, each in decisions.items() if due(each.status)}
 
 
-def total_time(seconds: Mapping[str, float | None]) -> str:
+def format_total_time(seconds: Mapping[str, float | None]) -> str:
     """Return the sum of seconds (stage -> seconds or None) as text, which names the stages without; "" if all are."""
     unknown = ", ".join(stage for stage, known in seconds.items() if known is None)
     total = sum(filter(None, seconds.values()))

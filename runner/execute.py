@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, artifacts, files, say
-from runner.durations import seconds_left, total_time, typical_seconds
+from runner.durations import format_total_time, seconds_by_stage, typical_seconds
 from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
@@ -65,7 +65,7 @@ def _run_stage(
     assert decision.inputs
     # If an interrupted run with the same key left this folder, the stage resumes from its state.
     partial = partial_folder(job, stage, decision.inputs.key)
-    artifacts.take_over(partial)
+    artifacts.restore_from_attempt(partial)
     if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
     if not read_receipt(partial):  # a receipt is there if it was copied, or the runner was killed before the renames
@@ -92,7 +92,7 @@ def _time_left(stage: str, seconds: dict[str, float | None]) -> str:
     """Return text on the expected time of a stage and of all in `seconds`; "" if that of the stage is unknown."""
     if (own := seconds.get(stage)) is None:
         return ""
-    return f"; about {format_seconds(own)}" + (f", {total_time(seconds)} to the end" if len(seconds) > 1 else "")
+    return f"; about {format_seconds(own)}" + (f", {format_total_time(seconds)} to the end" if len(seconds) > 1 else "")
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
@@ -206,7 +206,7 @@ def run_scene(
                 for warning in read_json(done[stage].path / "warnings.json") or ():  # a stage that runs prints its own
                     say(f"warning: {warning}")
             elif done[stage].status == "run":
-                seconds = seconds_left(job, {later: planned[later] for later in stages[position:]})
+                seconds = seconds_by_stage(job, {later: planned[later] for later in stages[position:]})
                 done[stage] = _run_stage(job, stage, _time_left(stage, seconds), done, lock, execution)
                 if any(planned[later].status == "pending" for later in stages[position + 1 :]):
                     planned = _plan_rest(job, stages, done)

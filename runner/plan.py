@@ -272,7 +272,7 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
     cure = f"`make weights profile={job.profile}` fetches it"
     lacks = [need for need in needed if need["problem"]]
     for need in (need for need in lacks if not need["optional"]):
-        fetch = f"; {cure} ({format_bytes(need['bytes'])})" if need["fetched"] else ""
+        fetch = f"; {cure} ({format_bytes(need['bytes'])})" if need["can_download"] else ""
         return Decision("missing", need["problem"] + fetch, needed=needed)
     if lacks:
         notes += (f"{lacks[0]['problem']}; {cure} ({format_bytes(sum(need['bytes'] or 0 for need in lacks))})",)

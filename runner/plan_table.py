@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from runner.durations import seconds_left, total_time
+from runner.durations import format_total_time, seconds_by_stage
 from runner.plan import Decision
 from runner.resolve import ResolvedJob
 from runner.text import format_bytes, format_seconds, join_names
@@ -16,18 +16,18 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     scene's folder from which files are read.
     """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
-    expected = seconds_left(job, decisions)
+    expected = seconds_by_stage(job, decisions)
     for stage, decision in decisions.items():
         seconds = expected.get(stage)
         time = f"~{format_seconds(seconds)}" if seconds is not None else ""
         lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
-    if total := total_time(expected):
+    if total := format_total_time(expected):
         lines.append(f"  together about {total}" + (f"; GPU: {job.gpu}" if job.gpu else ""))
     rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
     lines += [f"  besides, {line}" for line in rest]
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
-    if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
+    if sizes := [need["bytes"] or 0 for need in needs.values() if need["can_download"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {format_bytes(sum(sizes))}, by `make weights profile={job.profile}`")
     paths = {path for stage in decisions for path in job.paths_outside(stage)}
     folders = Counter(str(path if path.is_dir() else path.parent) for path in sorted(paths))

@@ -17,7 +17,7 @@ from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import load_references
-from reffusion.kernels.compiled import side_by_side, views_at_once
+from reffusion.kernels.compiled import map_in_threads, views_at_once
 from reffusion.params.initialize import Params
 from reffusion.trace import Trace
 from reffusion.types import Reference
@@ -54,7 +54,7 @@ def run(
     save_filling(out, filled)
     sets, scene = space.mask_sets | filled.restricted, space.scene
     find = lambda name: find_origins(filled.draft, scene.cameras[name], sets[name], filled.background)
-    origins = dict(zip(scene.train, side_by_side(find, scene.train, views_at_once(params.device)), strict=True))
+    origins = dict(zip(scene.train, map_in_threads(find, scene.train, views_at_once(params.device)), strict=True))
     for name, origin in origins.items():
         save_image(out / "origins" / f"{name}.png", origin.picture)
     save_json(out / "facts.json", summarize(space, filled, origins))

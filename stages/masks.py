@@ -66,7 +66,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     check_frame(poses, fit, gaussians, [scene.cameras[name] for name in scene.train])
     marks = load_marks(params, scene, gaussians, poses, raw_masks)
-    load_photos = lambda: exposure.load_normalized_views(poses, fit, scene.train)
+    load_photos = lambda: exposure.load_photos_in_scene_exposure(poses, fit, scene.train)
     found = classify_scene(params, scene, gaussians, marks, load_photos)
     messages = [*report_remnants(found.remnants, out, poses), *found.warnings]
     for line in messages:
@@ -225,6 +225,6 @@ def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera
     if not (poses / "gaussians.ply").exists():
         return
     some = train[:: max(1, len(train) // CHECKED_VIEWS)]
-    photos = exposure.load_normalized_views(poses, fit, [camera.name for camera in some])
+    photos = exposure.load_photos_in_scene_exposure(poses, fit, [camera.name for camera in some])
     if problem := provided_gaussians.explain_misplacement(gaussians, some, photos):
         raise ValueError(f"{poses / 'gaussians.ply'}: `gaussians` of scene.yaml: {problem}")

@@ -27,7 +27,7 @@ from scenes.capture import (
 
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.load import detect_layout, load_capture
-from reffusion.capture.roles import load_roles
+from reffusion.capture.roles import assign_roles
 from reffusion.io.colmap import load_images
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
@@ -276,7 +276,7 @@ def test_lists_of_training_and_test_views(tmp_path, lists, train, test):
     named = {f"{split}_filenames": [f"./images/v0{k}.png" for k in views] for split, views in lists.items()}
     change_transforms(tmp_path, lambda record: record.update(named))
     capture = load_capture(tmp_path)
-    roles = load_roles(tmp_path, capture)
+    roles = assign_roles(tmp_path, capture)
     assert roles.train == tuple(f"v0{k}" for k in train) and roles.test == tuple(f"v0{k}" for k in test)
     unused = sorted({f"v0{k}" for k in range(6)} - {*roles.train, *roles.test}, reverse=True)
     assert sorted(capture.unused, reverse=True) == unused and len(capture.warnings) == bool(unused)
@@ -302,7 +302,7 @@ def test_scene_yaml_prevails_over_lists(tmp_path):
     lists = {"train_filenames": ["images/v00.png", "images/v01.png"], "test_filenames": ["images/v05.png"]}
     change_transforms(tmp_path, lambda record: record.update(lists))
     capture = load_capture(tmp_path)
-    roles = load_roles(tmp_path, capture, test=["v02"], train=["v00", "v03", "v05"])
+    roles = assign_roles(tmp_path, capture, test=["v02"], train=["v00", "v03", "v05"])
     assert (roles.train, roles.test) == (("v00", "v03", "v05"), ("v02",))
 
 
@@ -397,7 +397,7 @@ def test_a_workspace_of_automatic_reconstruction(tmp_path):
     write_model(tmp_path / "dense/0/sparse", truth)
     write_masks(tmp_path / "masks", truth.world_to_camera)
     assert_cameras(capture := load_capture(tmp_path), truth)
-    assert len(load_roles(tmp_path, capture).masks[""]) == 6
+    assert len(assign_roles(tmp_path, capture).masks[""]) == 6
     distorted = make_truth(RADIAL)
     write_model(tmp_path / "sparse/0", distorted)
     assert_cameras(load_capture(tmp_path), truth)
@@ -461,7 +461,7 @@ def test_masks_beside_photographs(tmp_path, word):
     write_pictures(tmp_path / "images", ["a", "b", "c"])
     write_masks(tmp_path / "images", [f"{name}{word}" for name in "abc"])
     capture = load_capture(tmp_path)
-    assert [*capture.pictures] == ["a", "b", "c"] and [*load_roles(tmp_path, capture).masks[""]] == ["a", "b", "c"]
+    assert [*capture.pictures] == ["a", "b", "c"] and [*assign_roles(tmp_path, capture).masks[""]] == ["a", "b", "c"]
 
 
 def test_a_file_of_bundler_under_another_name_and_a_camera_of_polycam_without_a_size(tmp_path):
@@ -509,7 +509,7 @@ def test_endings_of_pictures(tmp_path, ending):
     write_model(tmp_path / "sparse/0", truth, ending=ending)
     write_masks(tmp_path / "masks", truth.world_to_camera)
     assert_cameras(capture := load_capture(tmp_path), truth)
-    assert len(load_roles(tmp_path, capture).masks[""]) == 6
+    assert len(assign_roles(tmp_path, capture).masks[""]) == 6
     assert np.abs(load_image(folder / f"v00{ending}").astype(int) - (200, 100, 50)).max() <= 3
 
 
@@ -530,7 +530,7 @@ def test_camera_raw_among_photographs(tmp_path):
     capture = load_capture(tmp_path)
     said = "images holds 2 .DNG pictures (camera raw), which are not read; develop them to JPEG"
     assert capture.warnings == (said,)
-    assert len(load_roles(tmp_path, capture).masks[""]) == 6
+    assert len(assign_roles(tmp_path, capture).masks[""]) == 6
 
 
 @pytest.mark.parametrize(

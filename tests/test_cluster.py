@@ -18,7 +18,7 @@ from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 from test_batch import read_spans, write_projects
 from test_runner_faults import assert_artifacts_complete
 
-from runner.artifacts import take_over
+from runner.artifacts import restore_from_attempt
 from runner.execute import Execution, run_scene
 from runner.fleet.compare import compare
 from runner.fleet.engine import LocalEngine, make_engine
@@ -91,7 +91,7 @@ def test_an_attempt_given_up_as_lost_writes_nothing(tmp_path, monkeypatch):
     def work(task: Task, should_stop=None) -> StageResult:
         mine = Path(task.line["out"])
         assert mine != out and not out.exists()
-        take_over(out)
+        restore_from_attempt(out)
         (out / "theirs.txt").touch()
         with pytest.raises(FileNotFoundError):
             (mine / "trace.jsonl").write_text("late")

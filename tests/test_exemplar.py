@@ -18,12 +18,12 @@ from reffusion.inpaint import exemplar, plane_frames
 from reffusion.inpaint.classical import telea
 from reffusion.inpaint.patchmatch import completion, search
 from reffusion.inpaint.patchmatch.completion import complete
-from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Level
+from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, PyramidLevel
 from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.shift_map import plane_symmetry
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
 from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, find_symmetry
-from reffusion.inpaint.source_image import without_geometry
+from reffusion.inpaint.source_image import flat_source
 from reffusion.types import Camera
 
 pytestmark = pytest.mark.integration
@@ -34,7 +34,7 @@ RED = (255, 0, 0)
 
 
 def complete_alone(image, mask, seed=0):
-    return complete(without_geometry(image, mask), mask, [without_geometry(image, mask)], seed=seed).image
+    return complete(flat_source(image, mask), mask, [flat_source(image, mask)], seed=seed).image
 
 
 def checker_image():
@@ -88,7 +88,7 @@ def test_sources_may_have_other_sizes(shape):
     image, nothing = np.full((96, 128, 3), 128, np.uint8), np.zeros(shape, bool)
     beside = np.abs(np.arange(128) - 64) > 30
     image[:, beside] = np.where(np.arange(128) % 6 < 3, 40, 210)[None, beside, None]
-    painted = complete(without_geometry(image, middle_mask()), middle_mask(), [without_geometry(source, nothing)]).image
+    painted = complete(flat_source(image, middle_mask()), middle_mask(), [flat_source(source, nothing)]).image
     assert painted[middle_mask()].std() > 50, "striped as the only source is"
 
 
@@ -96,17 +96,15 @@ def test_masked_pixels_of_a_source_never_show():
     image, mask, red = checker_image(), middle_mask(), np.zeros((96, 128), bool)
     red[::12, ::9] = True
     other = np.where(red[..., None], np.uint8(RED), checker_image())
-    source = replace(without_geometry(other, red), usable=np.ones_like(red))
-    painted = (
-        complete(without_geometry(image, mask), mask, [source, without_geometry(image, mask)]).image[mask].astype(int)
-    )
+    source = replace(flat_source(other, red), usable=np.ones_like(red))
+    painted = complete(flat_source(image, mask), mask, [source, flat_source(image, mask)]).image[mask].astype(int)
     assert (painted[:, 0] - painted[:, 1]).max() < 30
 
 
 def test_a_hole_that_no_patch_suits_is_the_worst_completion():
     """The only source shows the hole's plane from a distance 100 times smaller, so no patch has a suitable scale."""
     image, mask = checker_image(), middle_mask()
-    target = replace(without_geometry(image, mask), plane=np.ones((96, 128), np.int64))
+    target = replace(flat_source(image, mask), plane=np.ones((96, 128), np.int64))
     source = replace(target, to_plane=target.to_plane / 100, pixel_size=target.pixel_size / 100)
     found = complete(target, mask, [source], smooth=[1])
     assert found.misfit >= NO_MATCH and (found.image[~mask] == image[~mask]).all()
@@ -288,7 +286,7 @@ def test_the_misfit_is_the_mean_square_by_weight():
     pixels = completion._gather_hole(target, mask, 1, [1], pictures)
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2
-    of = Level(pixels, pictures, now, weight)
+    of = PyramidLevel(pixels, pictures, now, weight)
     found = search.misfit(0, True, 1, row, column, np.float32(angle), NO_MATCH, of)
     assert search.misfit(0, False, 1, row, column, np.float32(0), NO_MATCH, of) == NO_MATCH, (
         "along a plane nothing is shifted"

@@ -205,7 +205,7 @@ def test_without_onnxruntime_one_line_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(ValueError, match=r"lama_fp32.onnx needs onnxruntime: `pip install onnxruntime`"):
         load_inpainter("lama", tmp_path)
     (need,) = needed_weights("lama", tmp_path)
-    assert "pip install onnxruntime" in need.problem and not need.fetched
+    assert "pip install onnxruntime" in need.problem and not need.can_download
 
 
 # --------------------------------------------------------------------------------------------- the parameter, the stage
@@ -289,10 +289,10 @@ def test_the_key_of_scene_yaml_reaches_references_and_further_views(empty_weight
 
 def test_the_file_is_found_or_the_plan_says_where_people_get_it(empty_weight_cache, tmp_path):
     (need,) = needed_weights("lama")
-    assert (need.name, need.files, need.fetched) == ("Carve/LaMa-ONNX", ("lama_fp32.onnx",), True)
+    assert (need.name, need.files, need.can_download) == ("Carve/LaMa-ONNX", ("lama_fp32.onnx",), True)
     assert "Carve/LaMa-ONNX is not on this machine" in need.problem and "make weights" in need.problem
     (need,) = needed_weights("lama", tmp_path / "nowhere.onnx")
-    assert not need.fetched and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem
+    assert not need.can_download and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem
     (need,) = needed_weights("migan", write_torchscript_model(tmp_path / "big.pt"))
     assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
     (need,) = needed_weights("lama", tmp_path)

@@ -161,8 +161,9 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     assert scores[1] > scores[0] + 2
     away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
     names = [c.name for c in cameras]
-    assert away(exposure.load_normalized_views(poses, tmp_path / "True", names)) < 0.3 * away(load_views(poses, names))
-    for view, image in exposure.load_normalized_views(poses, tmp_path / "False", names).items():
+    corrected = exposure.load_photos_in_scene_exposure(poses, tmp_path / "True", names)
+    assert away(corrected) < 0.3 * away(load_views(poses, names))
+    for view, image in exposure.load_photos_in_scene_exposure(poses, tmp_path / "False", names).items():
         assert np.array_equal(image, photos[view])
     assert exposure.normalize_exposure(pictures[target.name], tmp_path / "True", target.name) is pictures[target.name]
 

@@ -47,7 +47,7 @@ def random_points() -> np.ndarray:
 def test_exact_matches_give_exact_depths():
     points, others = random_points(), CAMERAS[1:]
     matches = make_matches([project_points(points, o) for o in others], project_points(points, CAMERAS[0]))
-    depth, known = flow.triangulate(matches, BY_NAME)
+    depth, known = flow.depths_from_matches(matches, BY_NAME)
     assert known.all()
     np.testing.assert_allclose(depth, points[:, 2] + 1, rtol=1e-6)
     assert np.abs(flow.flow_residuals(matches, BY_NAME, depth)).max() < 1e-3
@@ -58,7 +58,7 @@ def test_a_wrong_match_in_one_view_does_not_matter():
     points, others = random_points(), CAMERAS[1:]
     places = [project_points(points, o) for o in others]
     places[1] = places[1] + (25.0, -14.0)
-    depth, known = flow.triangulate(make_matches(places, project_points(points, CAMERAS[0])), BY_NAME)
+    depth, known = flow.depths_from_matches(make_matches(places, project_points(points, CAMERAS[0])), BY_NAME)
     assert known.mean() > 0.8
     assert (np.abs(depth / (points[:, 2] + 1) - 1) < 1e-3)[known].mean() > 0.97
 
@@ -67,20 +67,20 @@ def test_what_moves_or_matches_nothing_is_left_out():
     points, others, rng = random_points(), CAMERAS[1:], np.random.default_rng(1)
     here = project_points(points, CAMERAS[0])
     scattered = [project_points(points, o) + rng.normal(0, 30, (len(points), 2)) for o in others]
-    assert flow.triangulate(make_matches(scattered, here), BY_NAME)[1].mean() < 0.05
+    assert flow.depths_from_matches(make_matches(scattered, here), BY_NAME)[1].mean() < 0.05
     nowhere = make_matches([project_points(points, o) for o in others], here, np.zeros((3, len(points)), bool))
-    assert not flow.triangulate(nowhere, BY_NAME)[1].any()
+    assert not flow.depths_from_matches(nowhere, BY_NAME)[1].any()
 
 
 def test_without_parallax_a_point_is_far_and_one_that_would_be_behind_is_none():
     directions = np.random.default_rng(2).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 1.0), (200, 3))
     others, here = CAMERAS[1:], project_points(CAMERAS[0].center + directions, CAMERAS[0])
-    depth, known = flow.triangulate(
+    depth, known = flow.depths_from_matches(
         make_matches([project_points(o.center + directions, o) for o in others], here), BY_NAME
     )
     assert known.all() and (depth > 1e4).all()
     behind = [project_points(o.center + directions + 0.3 * (o.center - CAMERAS[0].center), o) for o in others]
-    assert not flow.triangulate(make_matches(behind, here), BY_NAME)[1].any()
+    assert not flow.depths_from_matches(make_matches(behind, here), BY_NAME)[1].any()
 
 
 def paint_slope(slope: float) -> dict[str, np.ndarray]:

@@ -275,11 +275,11 @@ def test_a_pipeline_is_looked_for_before_any_work_and_fetched_whole(small_pipeli
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     needs = lambda source: plan_reference.needed_weights(Params(inpainter=pipeline_setting(source)), frozenset())
     (need,) = needs("acme/fill")
-    assert "acme/fill is not on this machine" in need.problem and need.fetched
+    assert "acme/fill is not on this machine" in need.problem and need.can_download
     (need,) = needs(small_pipelines / "sd3")
     assert need.problem is None
     (need,) = needs(tmp_path)
-    assert "model_index.json cannot be read" in need.problem and not need.fetched
+    assert "model_index.json cannot be read" in need.problem and not need.can_download
     folder = small_pipelines / "sd3"
     names = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
     names += ["text_encoder_3/config.json", "text_encoder_3/model.safetensors", "tokenizer_3/spiece.model"]
@@ -327,8 +327,8 @@ def test_files_that_are_not_moebius_are_refused_in_one_line(tmp_path):
     (folder / MOEBIUS.unet).unlink()
     params = Params(inpainter={"kind": "moebius", "weights": str(folder)}, prompt="a wall")
     (need,) = plan_reference.needed_weights(params, frozenset())
-    assert "holds no unet.onnx: it must hold" in need.problem and not need.fetched
+    assert "holds no unet.onnx: it must hold" in need.problem and not need.can_download
     (need,) = plan_reference.needed_weights(Params(inpainter="moebius"), frozenset())
-    assert need.name == MOEBIUS.repo and need.files == MOEBIUS.files and need.fetched
+    assert need.name == MOEBIUS.repo and need.files == MOEBIUS.files and need.can_download
     (note,) = plan_reference.preview(params, scene=tmp_path)
     assert "by Moebius, 4 candidates; the prompt 'a wall' is not read" in note

@@ -243,8 +243,8 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
     predict = diffusion.raw_prediction
     monkeypatch.setattr(diffusion, "raw_prediction", lambda p, z, *rest: rows.append(len(z)) or predict(p, z, *rest))
     with torch.no_grad():
-        plain = diffusion.guided(prior, noisy, at, condition, empty, None, 0.0)
-        guided = diffusion.guided(prior, noisy, at, condition, empty, empty, 7.5)
+        plain = diffusion.predict_with_guidance(prior, noisy, at, condition, empty, None, 0.0)
+        guided = diffusion.predict_with_guidance(prior, noisy, at, condition, empty, empty, 7.5)
     assert rows == [2, 2] and all(torch.equal(a, b) for a, b in zip(plain, guided, strict=True))
 
 
@@ -311,7 +311,7 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
 
 
 def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
-    monkeypatch.setattr(image_detail, "supported_sh_degree", lambda *_: (0, 1.0))
+    monkeypatch.setattr(image_detail, "choose_sh_degree", lambda *_: (0, 1.0))
     scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
     degree = lambda few_views: limit_sh_degree(fit.Params(few_views=few_views), scene).sh.degree
     assert [degree(each) for each in ("as_many", "fewer_harmonics", "surfaces")] == [3, 0, 0]

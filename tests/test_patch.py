@@ -187,7 +187,7 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path, antialiased):
         center = scene.similarity.apply(-pose[:3, :3].T @ pose[:3, 3])
         np.testing.assert_allclose(scene.cameras[name].center, center, atol=1e-9)
         np.testing.assert_allclose(mine[:3, :3], pose[:3, :3], atol=1e-9)
-    seen = exposure.load_normalized_views(out, out, ["v02"])["v02"]
+    seen = exposure.load_photos_in_scene_exposure(out, out, ["v02"])["v02"]
     gaussians = load_ply(out / "gaussians.ply")
     renders = {flag: rasterizer.render(replace(gaussians, antialiased=flag), scene.cameras["v02"]).color.numpy()
                for flag in (False, True)}  # fmt: skip

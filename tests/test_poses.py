@@ -39,7 +39,7 @@ from scenes.capture import (
 from reffusion.capture import lens, normalized_frame, preparation, spinnerf_scenes
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
-from reffusion.capture.roles import load_roles
+from reffusion.capture.roles import assign_roles
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
@@ -489,7 +489,7 @@ def test_statue(tmp_path):
 
 def test_bear(tmp_path):
     with pytest.raises(ValueError, match="no mask at all"):
-        load_roles(real_capture("bear"), load_capture(real_capture("bear")))
+        assign_roles(real_capture("bear"), load_capture(real_capture("bear")))
     names = ["frame_00001", "frame_00030", "frame_00060", "frame_00090"]
     scene, out = run_on_real_capture(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
     assert len(scene.points) == 34174 and scene.test == ("frame_00090",)

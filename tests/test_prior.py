@@ -122,10 +122,10 @@ def test_guidance_zero_is_the_conditional_prediction(tiny_prior):
     condition = diffusion.conditioning(tiny_prior, random_images(1, 16), half_masks(1, 16))
     plain, _ = diffusion.predict(tiny_prior, noisy, t, condition, text)
     without, _ = diffusion.predict(tiny_prior, noisy, t, condition, empty)
-    guided, _ = diffusion.guided(tiny_prior, noisy, t, condition, text, empty, 2.0)
+    guided, _ = diffusion.predict_with_guidance(tiny_prior, noisy, t, condition, text, empty, 2.0)
     assert torch.allclose(guided, 3 * plain - 2 * without, atol=1e-5)
     with pytest.raises(ValueError, match="empty prompt"):
-        diffusion.guided(tiny_prior, noisy, t, condition, text, None, 1.0)
+        diffusion.predict_with_guidance(tiny_prior, noisy, t, condition, text, None, 1.0)
 
 
 @pytest.mark.integration

@@ -626,7 +626,7 @@ class Need:
     name: str
     problem: str | None
     bytes: int | None = None
-    fetched: bool = True
+    can_download: bool = True
     optional: bool = False
 
     def fetch(self):

@@ -109,10 +109,10 @@ def test_no_more_harmonics_than_views():
     cameras = [wall_scene.front_camera(f"c{k}", 0.01 * k) for k in range(20)]
     point, behind = np.array([[0.0, 0.0, wall_scene.WALL]]), np.array([[0.0, 0.0, -wall_scene.WALL]])
     for count, degree in ((1, 0), (3, 0), (4, 1), (8, 1), (9, 2), (16, 3), (20, 3)):
-        assert image_detail.supported_sh_degree(point, cameras[:count], 3) == (degree, count)
-    assert image_detail.supported_sh_degree(point, cameras, 1)[0] == 1
-    assert image_detail.supported_sh_degree(behind, cameras, 3) == (0, 0)
-    assert image_detail.supported_sh_degree(np.zeros((0, 3)), cameras[:9], 3) == (2, 9)
+        assert image_detail.choose_sh_degree(point, cameras[:count], 3) == (degree, count)
+    assert image_detail.choose_sh_degree(point, cameras, 1)[0] == 1
+    assert image_detail.choose_sh_degree(behind, cameras, 3) == (0, 0)
+    assert image_detail.choose_sh_degree(np.zeros((0, 3)), cameras[:9], 3) == (2, 9)
 
 
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):

@@ -141,9 +141,9 @@ def test_the_clock_stands_while_something_is_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(trace.time, "perf_counter", lambda: now[0])
     log = trace.Trace(tmp_path, start_seconds=5.0)
     now[0] += 2
-    with log.paused():
+    with log.pause():
         now[0] += 50
-        with log.paused():
+        with log.pause():
             now[0] += 7
         now[0] += 1000
         assert log.seconds == 7
@@ -160,9 +160,9 @@ def test_the_clock_stands_while_something_is_measured(tmp_path, monkeypatch):
 
 
 def test_moments_depend_on_the_iteration_only():
-    assert [i for i in range(41) if trace.log_spaced(i, 40)] == [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 40]
-    assert [i for i in range(41) if trace.log_spaced(i, 40, 2, 16)] == [0, 1, 16, 23, 32, 40]
-    assert [i for i in range(41) if trace.log_spaced(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
+    assert [i for i in range(41) if trace.is_log_step(i, 40)] == [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 40]
+    assert [i for i in range(41) if trace.is_log_step(i, 40, 2, 16)] == [0, 1, 16, 23, 32, 40]
+    assert [i for i in range(41) if trace.is_log_step(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
 
 
 KILLED = {

@@ -3,7 +3,7 @@
 import numpy as np
 from scenes.cameras import make_camera, project_points, yaw
 
-from reffusion.fit.unmatched import CELL, FARTHER, REACH, place_unmatched
+from reffusion.fit.unmatched import CELL, FARTHER, REACH, points_for_empty_cells
 
 SIZE, FOCAL, DEPTH = (160, 120), 150.0, 3.0
 HERE = make_camera("here", SIZE, FOCAL, (0.0, 0.0, 0.0), np.eye(3))
@@ -23,7 +23,7 @@ def picture() -> np.ndarray:
 
 
 def test_points_continue_the_surface_beside_them():
-    added, colors = place_unmatched([HERE], {"here": picture()}, wall(DEPTH, (0, 80)))
+    added, colors = points_for_empty_cells([HERE], {"here": picture()}, wall(DEPTH, (0, 80)))
     places = project_points(added, HERE)
     np.testing.assert_allclose(added[:, 2], DEPTH, rtol=1e-9)
     assert places[:, 0].min() > 80 + (REACH - 1) * CELL
@@ -38,7 +38,7 @@ def test_no_point_stands_before_what_another_view_sees():
     far = np.stack([3.0 - z, y, DEPTH + x], 1)
     pole = wall(DEPTH, (0, 40))
     points = np.concatenate([pole, far])
-    added, _ = place_unmatched([HERE, across], {"here": picture(), "across": picture()}, points)
+    added, _ = points_for_empty_cells([HERE, across], {"here": picture(), "across": picture()}, points)
     own = added[added[:, 0] > 3.0 - 7.0 + 1e-6]
     shown = project_points(own, across)
     seen = (own[:, 0] < 3.0) & (shown > 0).all(1) & (shown < SIZE).all(1)
@@ -52,5 +52,5 @@ def test_no_point_stands_before_what_another_view_sees():
 
 def test_views_that_show_points_everywhere_or_nowhere_get_none():
     for points in (wall(DEPTH, (0, SIZE[0])), np.array([[0.0, 0.0, -1.0]])):
-        added, colors = place_unmatched([HERE], {"here": picture()}, points)
+        added, colors = points_for_empty_cells([HERE], {"here": picture()}, points)
         assert added.shape == (0, 3) and colors.shape == (0, 3)

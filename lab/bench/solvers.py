@@ -89,7 +89,7 @@ def along(work: Callable, error: Callable, repeats: int = 3) -> dict[int, tuple[
         def watch(step: int, look: Callable) -> None:
             nonlocal began
             now = time.process_time()
-            if trace.log_spaced(step, -1, per_octave=1):
+            if trace.is_log_step(step, -1, per_octave=1):
                 seconds[step] = min(seconds.get(step, float("inf")), now - began)
                 errors[step] = error(look()[0])
             began += time.process_time() - now

@@ -73,7 +73,7 @@ def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) 
     if guidance is None:
         return noisy, *diffusion.predict(model(), noisy, times, condition, prompts()[:1])
     empty = prompts()[2:] if empty is None else empty
-    return noisy, *diffusion.guided(model(), noisy, times, condition, prompts()[:1], empty, guidance)
+    return noisy, *diffusion.predict_with_guidance(model(), noisy, times, condition, prompts()[:1], empty, guidance)
 
 
 def reconstruction_error(t: int, guidance: float | None = None) -> float:

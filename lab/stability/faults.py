@@ -90,7 +90,7 @@ FAULTS = (
           lambda right: lambda z, denoise, t, noise, alphas, weighting: right(
               z, denoise, t, noise, alphas.to(z), weighting=weighting),
           "timestep 0, half precision, score distillation"),
-    Fault("guidance of a instead of 1 + a", "reffusion.prior.diffusion", "guided",
+    Fault("guidance of a instead of 1 + a", "reffusion.prior.diffusion", "predict_with_guidance",
           lambda right: lambda *arguments: (right(*arguments)[0] - right(*arguments[:-1], 0)[0], right(*arguments)[1]),
           "guidance 100, equal prompts"),
     Fault("a tie that masks", "reffusion.masks.voting", "label_gaussians",

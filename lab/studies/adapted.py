@@ -62,7 +62,7 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
     keep = ~load_labels(run / "masks" / "labels.npy")
     remaining = load_ply(run / "fit" / "gaussians.ply").map(lambda p: p[keep])
     chosen = pick_evenly(names, count)
-    photos = exposure.load_normalized_views(run / "poses", run / "fit", chosen)
+    photos = exposure.load_photos_in_scene_exposure(run / "poses", run / "fit", chosen)
     known = lambda n: inpaint.composite_background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
     return {name: (known(name), sets[name].invent) for name in chosen}
 

@@ -132,7 +132,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
         log = trace.Trace(Path(folder))
         for step in range(max(MEASURED_STEPS) + 1):
             if step in MEASURED_STEPS:
-                with log.paused():
+                with log.pause():
                     log.log(step, **score_views(optimizer.gaussians, views))
             if step < max(MEASURED_STEPS):
                 take_step(optimizer, step, objective)

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from reffusion import trace
-from reffusion.fit.exposure import load_normalized_views
+from reffusion.fit.exposure import load_photos_in_scene_exposure
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene, load_views
 from reffusion.metrics import image_metrics, lpips
@@ -108,7 +108,8 @@ def measure_training(poses: Path, folder: Path, every: int) -> tuple[float, floa
     scene, gaussians = load_scene(poses), load_ply(folder / "gaussians.ply")
     held_out = scene.train[every // 2 :: every]
     worst, shares = [], []
-    for name, photo in load_normalized_views(poses, folder, [n for n in scene.train if n not in held_out]).items():
+    photos = load_photos_in_scene_exposure(poses, folder, [n for n in scene.train if n not in held_out])
+    for name, photo in photos.items():
         error = render(gaussians, scene.cameras[name]).color.clamp(0, 1).numpy() - photo / np.float32(255)
         squared = np.square(error).mean(2)
         high, wide = (length // BLOCK for length in squared.shape)

@@ -64,18 +64,18 @@ def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float
     settings = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
     settings |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
     folders = {need: run / need if (run / need).exists() else None for need in needs}
-    params, every = stage.Params(**settings), trace.log_spaced
+    params, every = stage.Params(**settings), trace.is_log_step
     times: dict[bool, list[float]] = {False: [], True: []}
     lines = {}
     cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)  # compiles, fills caches
     try:
         for _ in range(repeats):
             for traced in (False, True):
-                trace.log_spaced = every if traced else (lambda i, last, per_octave=2, first=1: i == last)
+                trace.is_log_step = every if traced else (lambda i, last, per_octave=2, first=1: i == last)
                 seconds, lines[traced] = cpu_seconds(stage, params, folders)
                 times[traced].append(seconds)
     finally:
-        trace.log_spaced = every
+        trace.is_log_step = every
     plain, traced = (sorted(times[which])[repeats // 2] for which in (False, True))
     short = cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)[0]
     return plain, traced, lines[True] - lines[False], (plain - short) / (steps - 2)
@@ -96,7 +96,7 @@ def main() -> int:
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments
-        share = moment * sum(trace.log_spaced(i, full, *STAGES[name][3]) for i in range(full + 1)) / (full * step)
+        share = moment * sum(trace.is_log_step(i, full, *STAGES[name][3]) for i in range(full + 1)) / (full * step)
         over += share > ALLOWED
         print(f"{name:<12} {plain:7.2f} s {traced:7.2f} s {moments:8} {moment:7.3f} s {step:6.3f} s {share:12.2%}")
     return 1 if over else 0

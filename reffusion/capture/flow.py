@@ -74,7 +74,7 @@ def triangulate_points(
     points, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
     for matches in match_views(cameras, cameras, images, cell):
         camera = by_name[matches.view]
-        depth, known = triangulate(matches, by_name)
+        depth, known = depths_from_matches(matches, by_name)
         depth = np.minimum(depth, FARTHEST)
         fresh = known & ~_is_covered(camera, points, matches.pixels, depth, cell)
         pixels, depth = matches.pixels[fresh], depth[fresh]
@@ -194,7 +194,7 @@ def _local_contrast(gray: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- depth
 
 
-def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
+def depths_from_matches(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
     """Compute the depths of a view's pixels from their matches in neighboring views.
 
     Let R and t be the rotation and translation from this view to a neighbor, and let a pixel's ray have z = 1. The

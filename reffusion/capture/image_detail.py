@@ -59,7 +59,7 @@ def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
     return int(np.median(seen)) if len(points) else len(cameras)
 
 
-def supported_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
+def choose_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
     """Return the highest degree of spherical harmonics that the number of views supports, at most `most`.
 
     A degree has (degree + 1)^2 coefficients per color. The degree is supported if at least that many views contain a

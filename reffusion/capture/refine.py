@@ -124,7 +124,7 @@ def flow_residual(matches: Sequence[flow.Matches], cameras: Mapping[str, Camera]
     """
     lengths = []
     for match in matches:
-        depth, known = flow.triangulate(match, cameras)
+        depth, known = flow.depths_from_matches(match, cameras)
         block = (match.pixels // (BLOCK * cell)).astype(int) @ (100_000, 1)
         for vectors, seen in zip(flow.flow_residuals(match, cameras, depth), match.seen, strict=True):
             usable = known & seen & np.isfinite(vectors).all(1)
@@ -140,7 +140,7 @@ def _build_tracks(matches: Sequence[flow.Matches], cameras: Mapping[str, Camera]
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:
-        depth, known = flow.triangulate(match, cameras)
+        depth, known = flow.depths_from_matches(match, cameras)
         depth = np.minimum(depth, flow.FARTHEST)
         away = np.abs(flow.flow_residuals(match, cameras, depth)).max(2)
         agree = match.seen & (away < flow.RESIDUAL)

@@ -88,7 +88,7 @@ class Roles:
         return roles
 
 
-def load_roles(
+def assign_roles(
     folder: Path,
     capture: Capture,
     *,
@@ -241,7 +241,7 @@ def _split_views(
     camera_only: list[str],
     capture: Capture,
 ) -> tuple[list[str], list[str]]:
-    """Return the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
+    """Return the training and test views, see `assign_roles`; `labelled` are the views of the test masks."""
     test_views = test if test is not None else (labelled or [*capture.test] or _views_named_test(capture))
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *camera_only, *capture.unused}]

@@ -12,7 +12,7 @@ from reffusion.capture.lens import undistorted_pinhole
 from reffusion.capture.load import LONGEST, load_capture
 from reffusion.capture.mask_files import group_by_object
 from reffusion.capture.names import list_pictures
-from reffusion.capture.roles import Roles, load_roles
+from reffusion.capture.roles import Roles, assign_roles
 from reffusion.capture.views import resolve_view
 from reffusion.io.files import BadInput, is_file
 from reffusion.io.splats import load_splats, summarize_splats
@@ -39,7 +39,7 @@ def read_scene(
     specs = reference_list(params.reference)
     references = frozenset(scene / name for each in specs for name in (each.image, each.depth) if name is not None)
     capture = load_capture(scene, params.layout, params.images, longest, references, correction)
-    roles = load_roles(
+    roles = assign_roles(
         scene,
         capture,
         masks=params.masks,

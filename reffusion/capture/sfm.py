@@ -123,7 +123,7 @@ def reconstruct(
             "Take more photos that overlap by two thirds, sharp and of things that do not move, or bring poses"
         )
     lenses = len({image.camera_id for image in placed.values()})
-    poses = _poses_of(model, placed, turned)
+    poses = _read_poses(model, placed, turned)
     shutil.rmtree(work)
     return Reconstruction(
         poses, len(photographs), lenses, model.compute_mean_track_length(), model.compute_mean_reprojection_error()
@@ -177,8 +177,8 @@ def _file_of(view: str) -> str:
     return f"{view}.png"
 
 
-def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[str]) -> Poses:
-    """Return the lenses, poses and points of a `pycolmap.Reconstruction`, undoing the turn of the pictures `turned`."""
+def _read_poses(model, images: Mapping[str, pycolmap.Image], turned: Collection[str]) -> Poses:
+    """Return the lenses and poses of `images`, and the points; views in `turned` are turned back by 90 degrees."""
     # turns by 90 degrees clockwise (x right, y down), as the pictures were turned counterclockwise
     back = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
     poses, lenses = {}, {}

@@ -12,7 +12,7 @@ from pathlib import Path
 from reffusion.capture.layouts.capture import find_pictures
 from reffusion.capture.layouts.colmap import find_model
 from reffusion.capture.load import load_capture
-from reffusion.capture.roles import load_roles
+from reffusion.capture.roles import assign_roles
 from reffusion.io.files import BadInput, is_file
 from reffusion.io.images import image_size
 
@@ -59,7 +59,7 @@ def summarize_scene(folder: Path) -> str:
     lacks = f"lacks {'; '.join(missing)}" if missing else ""
     try:
         capture = load_capture(folder, "llff")
-        roles = load_roles(folder, capture)
+        roles = assign_roles(folder, capture)
     except BadInput as error:
         return f"cannot be run: {lacks or error}"
     counts = f"{len(roles.train)} training and {len(roles.test)} test views"

@@ -91,7 +91,7 @@ def color_votes(
     names = sorted(cameras)
     sums, means = np.zeros((len(gaussians), 2)), gaussians.means
     features = torch.as_tensor(np.stack([known.inside, known.outside], 1)).to(means)
-    chosen = spread_evenly(names, VIEWS)
+    chosen = sample_evenly(names, VIEWS)
     for name in chosen:
         width, height = cameras[name].width, cameras[name].height
         factor = min(1.0, LONGEST / max(width, height))
@@ -131,6 +131,6 @@ def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) 
     return np.log(like / other).clip(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).reshape(inside.shape)
 
 
-def spread_evenly(names: Sequence[str], most: int) -> list[str]:
+def sample_evenly(names: Sequence[str], most: int) -> list[str]:
     """Return at most `most` of the names, at equal steps."""
     return [names[k] for k in np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int))]

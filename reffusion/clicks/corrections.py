@@ -13,7 +13,7 @@ import numpy as np
 
 from reffusion.clicks.geodesic_cut import correct_labels
 from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, clicks_of, confirmed_pixels, mark_pixels, stroke_pixels
-from reffusion.clicks.mask_borders import BAND, bounding_box, cut_box, refine_edges
+from reffusion.clicks.mask_borders import BAND, bounding_box, find_thing_in_box, refine_edges
 from reffusion.clicks.pixel_grid import downscale, find_depth_edges, part_at, pixel_pairs, upscale, value_at
 from reffusion.clicks.segmenter import Prompt
 from reffusion.clicks.single_view import ViewEvidence, pick_by_size, propose_masks, segment_view, select_object
@@ -68,7 +68,7 @@ def apply_box(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) -> 
     inside[top : max(bottom, top + 1), left : max(right, left + 1)] = True
     allowed = inside & (confirmed_pixels(marks, before.shape) != (OTHER if mark.positive else OBJECT))
     if view.ask is None:
-        found = [(cut_box(view.image, inside), 1.0), (inside, 0.0)]
+        found = [(find_thing_in_box(view.image, inside), 1.0), (inside, 0.0)]
     else:
         found = [(each.mask & inside, each.score) for each in view.ask(Prompt(clicks_of([]), mark.box))]
     found = [pair for pair in found if pair[0].any()] or [(inside, 0.0)]
@@ -114,7 +114,7 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) 
     apply = lambda region: before | region if positive else before & ~region
     opposite, speck = clicks.points[clicks.positive != positive], int(dot.sum())
     proposed = [apply(region) for region in regions if region.any()]
-    results = [result for result in proposed if not _isolates_click(before, result, opposite, speck)]
+    results = [result for result in proposed if not _leaves_speck(before, result, opposite, speck)]
     if size and results:
         changes = [result ^ before for result in results]
         return before ^ pick_by_size(changes, size)
@@ -124,8 +124,8 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) 
     return results[0] if best is None else best
 
 
-def _isolates_click(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
-    """Return whether a correction leaves fewer than `least` px of the region that one of the earlier clicks is on."""
+def _leaves_speck(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
+    """Return whether a correction shrinks the region around one of `points` from `least` px or more to fewer."""
 
     def is_speck(mask: np.ndarray, at: np.ndarray) -> bool:
         return bool(part_at(mask == value_at(before, at), at).sum() < least)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from reffusion import geometry
-from reffusion.clicks.color_evidence import spread_evenly
+from reffusion.clicks.color_evidence import sample_evenly
 from reffusion.clicks.events import Event
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.single_view import ViewEvidence
@@ -35,7 +35,7 @@ class FittedViews:
     @cached_property
     def network_views(self) -> frozenset[str]:
         """The views in which the network is asked for the object that other views show, evenly spread by name."""
-        return frozenset(spread_evenly(sorted(self.cameras), MAX_NETWORK_VIEWS))
+        return frozenset(sample_evenly(sorted(self.cameras), MAX_NETWORK_VIEWS))
 
     def depth(self, name: str) -> np.ndarray:
         """Return the depth of the surface that a view shows, [H, W] camera z."""

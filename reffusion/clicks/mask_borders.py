@@ -49,7 +49,7 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
     return found
 
 
-def cut_box(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def find_thing_in_box(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the thing inside a box, found by GrabCut: its colors are rare around the box.
 
     Colors are compared up to the box's own size away from it. The result is empty if the box has no surroundings.

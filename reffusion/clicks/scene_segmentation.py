@@ -27,7 +27,7 @@ Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> m
 
 
 @dataclass(frozen=True)
-class Settled:
+class SavedMasks:
     """Masks that were saved after some marks.
 
     Attributes:
@@ -39,7 +39,7 @@ class Settled:
     masks: Masks
 
 
-def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
+def no_cache(_: Hashable, compute: Callable[[], Masks]) -> Masks:
     """Compute the masks without a cache: the default `recall` of `segment_scene`."""
     return compute()
 
@@ -48,8 +48,8 @@ def segment_scene(
     views: FittedViews,
     events: Sequence[Event],
     given: Masks,
-    recall: Recall = compute_always,
-    settled: Settled | None = None,
+    recall: Recall = no_cache,
+    settled: SavedMasks | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -83,7 +83,7 @@ def segment_scene(
 
 
 def segment_first(
-    evidence_of: Callable[[str], ViewEvidence], first: Mapping[str, Sequence[Event]], recall: Recall = compute_always
+    evidence_of: Callable[[str], ViewEvidence], first: Mapping[str, Sequence[Event]], recall: Recall = no_cache
 ) -> dict[str, np.ndarray]:
     """Return the masks of the views in which the object is selected, view -> bool [H, W].
 
@@ -99,7 +99,7 @@ def segment_first(
 
 
 def segment_own_view(
-    evidence_of: Callable[[str], ViewEvidence], events: Sequence[Event], recall: Recall = compute_always
+    evidence_of: Callable[[str], ViewEvidence], events: Sequence[Event], recall: Recall = no_cache
 ) -> Masks:
     """Return the mask of one view from its own marks alone, as {view name: bool [H, W]}.
 
@@ -158,7 +158,7 @@ def correct_scene(
     masks: Masks,
     known: Collection[str],
     given: Masks,
-    recall: Recall = compute_always,
+    recall: Recall = no_cache,
 ) -> dict[str, np.ndarray]:
     """Return the masks of all views after the last `count` events, which are in one view, view -> bool [H, W].
 
@@ -193,7 +193,7 @@ def _is_allowed(events: Sequence[Event], name: str, mask: np.ndarray) -> np.ndar
 
 
 def correct_own_view(
-    views: FittedViews, events: Sequence[Event], count: int, masks: Masks, recall: Recall = compute_always
+    views: FittedViews, events: Sequence[Event], count: int, masks: Masks, recall: Recall = no_cache
 ) -> dict[str, np.ndarray]:
     """Return the mask of the last event's view after the last `count` events, as {view: bool [H, W]}.
 

@@ -83,7 +83,8 @@ def propose_masks(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
     """Return masks of the object that the positive clicks are on, bool [H, W] each; no mask without a positive click.
 
     The first mask is found by colors and surfaces. The network's masks follow, if there is a network: all masks for
-    the clicks, from part to whole, and the mask of the whole object for the clicks and the first mask's bounding box.
+    the clicks, from part to whole, and, unless the first mask is empty, the mask of the whole object for the clicks and
+    the first mask's bounding box. Masks may contradict clicks.
     """
     if not clicks.positive.any():
         return []

@@ -17,7 +17,7 @@ from scipy import ndimage
 from reffusion import geometry, morphology, seeding
 from reffusion.depth import bilateral, planes
 from reffusion.depth.completion import Plate, complete
-from reffusion.depth.layers import label_surfaces, plane_labels
+from reffusion.depth.layers import label_surfaces, surfaces_on_planes
 from reffusion.depth.solverlog import NO_LOG, SolverLog
 from reffusion.types import Camera, Rendering
 
@@ -292,7 +292,7 @@ def _complete_layers(
 ) -> np.ndarray:
     """Return disparity [H, W] in which each surface is continued smoothly by itself, with a step between surfaces."""
     # The graph cut may give a surface pixels at which a plane was assumed to continue.
-    reassigned = view.anchored & (plane_labels(view.disparity, view.anchored, surfaces, planes) != surfaces)
+    reassigned = view.anchored & (surfaces_on_planes(view.disparity, view.anchored, surfaces, planes) != surfaces)
     usable = view.known | (view.anchored & ~reassigned)
     result = np.where(usable, view.disparity, 0.0)
     for surface in range(1, surfaces.max() + 1):

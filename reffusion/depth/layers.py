@@ -72,7 +72,10 @@ def label_surfaces(
     index[domain] = np.arange(domain.sum())
     colors = ndimage.gaussian_filter(unit_range(guide), (1, 1, 0))
     cost = COLOR_WEIGHT * _color_cost(colors, surfaces, domain)
-    label, assumed_label = _at(surfaces, domain) - 1, plane_labels(disparity, assumed, surfaces, planes)[domain] - 1
+    label, assumed_label = (
+        _at(surfaces, domain) - 1,
+        surfaces_on_planes(disparity, assumed, surfaces, planes)[domain] - 1,
+    )
     for k in range(count):
         cost[k] += PLANE_PRIOR_COST * ((assumed_label >= 0) & (assumed_label != k)) + HARD * (
             (label >= 0) & (label != k)
@@ -128,7 +131,7 @@ def _color_cost(colors: np.ndarray, surfaces: np.ndarray, pixels: np.ndarray) ->
     return -np.log(likelihood / likelihood.sum(0))
 
 
-def plane_labels(
+def surfaces_on_planes(
     disparity: np.ndarray, pixels: np.ndarray, surfaces: np.ndarray, planes: Sequence[np.ndarray]
 ) -> np.ndarray:
     """Return int [H, W], for each of `pixels` the surface that lies on the same plane; 0 at all other pixels.

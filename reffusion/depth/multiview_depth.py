@@ -22,7 +22,7 @@ from reffusion.depth.sparse_to_dense import (
     interpolate_depth,
     visible_samples,
 )
-from reffusion.kernels.compiled import side_by_side
+from reffusion.kernels.compiled import map_in_threads
 from reffusion.types import Camera
 
 MAX_NEIGHBORS, MAX_ANGLE_DEG = (
@@ -67,7 +67,7 @@ def estimate_multiview_depth(
     """
     samples = {camera.name: visible_samples(points, camera, images[camera.name]) for camera in cameras}
     interpolate = lambda camera: interpolate_depth(samples[camera.name], camera, images[camera.name])
-    found = zip(samples, side_by_side(interpolate, cameras), strict=True)
+    found = zip(samples, map_in_threads(interpolate, cameras), strict=True)
     initial = {name: depth for name, depth in found if depth is not None}
     views = [camera for camera in cameras if camera.name in initial]
     planes = {view.name: _refine_planes(view, views, images, initial[view.name], seed) for view in views}
@@ -79,7 +79,7 @@ def estimate_multiview_depth(
     complete = lambda view: _complete_depth(
         view, images[view.name], samples[view.name], planes[view.name], depth[view.name], confirmed[view.name]
     )
-    depth = dict(zip(depth, side_by_side(complete, views), strict=True))
+    depth = dict(zip(depth, map_in_threads(complete, views), strict=True))
     return {
         view.name: MultiviewDepth(
             depth[view.name], confirmed[view.name], _refuted_pixels(view, depth, confirmed, views)

@@ -38,8 +38,8 @@ class SolverLog:
                 this iteration is logged.
         """
         self.iterations = iteration
-        if self.log is not None and trace.log_spaced(iteration, -1, per_octave=4):
-            with self.log.paused():
+        if self.log is not None and trace.is_log_step(iteration, -1, per_octave=4):
+            with self.log.pause():
                 result, residual = get_result()
                 self.log.log(iteration, series=f"bilateral {self.view}", residual=residual, **self._error(result))
 
@@ -52,7 +52,7 @@ class SolverLog:
             iterations: The number of iterations that the solver took.
         """
         if self.log is not None:
-            with self.log.paused():
+            with self.log.pause():
                 end = {"reason": "converged"}
                 self.log.log(iterations, series=f"{solver} {self.view}", **self._error(result), **end)
 

@@ -130,7 +130,7 @@ def distill(
         average(optimizer, settings, done)
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~has_changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        if trace.log_spaced(done, settings.iterations, per_octave=4):
+        if trace.is_log_step(done, settings.iterations, per_octave=4):
             _write_line(log, run, line)
         _save_snapshot(optimizer, folder, done, settings.iterations)
         if checkpoints.due:
@@ -322,7 +322,7 @@ def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
     optimizer, objective = run.optimizer, run.objective
     end = {"reason": "finished"} if run.step == objective.settings.iterations else {}
     counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
-    with log.paused():
+    with log.pause():
         measured = [reference for reference in objective.references if reference.hole.any()]
         if measured:
             line = line | {"reference_psnr": _reference_psnr(optimizer.gaussians, measured)}

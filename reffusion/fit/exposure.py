@@ -222,7 +222,7 @@ def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return float(gain), float(offset)
 
 
-def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+def load_photos_in_scene_exposure(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Load the photographs of the named views, with the exposure of the Gaussians (see `normalize_exposure`).
 
     A photograph without a fitted exposure, as a test view's, is loaded as it is. A view without a photograph gets a

@@ -14,7 +14,7 @@ from reffusion.fit import few_views
 from reffusion.fit.exposure import BRIGHTNESS_DEVIATION
 from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.fit.start import initial_gaussians
-from reffusion.fit.unmatched import place_unmatched
+from reffusion.fit.unmatched import points_for_empty_cells
 from reffusion.io.images import to_uint8
 from reffusion.masks import voting
 from reffusion.params.fit import Params
@@ -33,7 +33,7 @@ def limit_sh_degree(params: Params, scene: Scene) -> Params:
     max_degree = params.sh.degree
     if params.few_views == "as_many":
         return params
-    degree, views = image_detail.supported_sh_degree(
+    degree, views = image_detail.choose_sh_degree(
         scene.points, [scene.cameras[name] for name in scene.train], max_degree
     )
     if degree == max_degree:
@@ -119,7 +119,7 @@ def collect_points(
     """Collect the points from which a fit starts: the sparse points, and points where pictures show more.
 
     If `params.init.flow_cell` is not 0, points are triangulated from optical flow, and added where a view shows no
-    point (`place_unmatched`). A point is left out if it projects into `hidden` in
+    point (`points_for_empty_cells`). A point is left out if it projects into `hidden` in
     more than half of those views that have such a mask and contain the point, because no supervising pixel would ever
     move Gaussians there.
 
@@ -136,7 +136,7 @@ def collect_points(
         flow_points, flow_colors = flow.triangulate_points(cameras, images, params.init.flow_cell)
         print(f"{len(flow_points)} points by optical flow beside {len(points)}", flush=True)
         points, colors = np.concatenate([points, flow_points]), np.concatenate([colors, flow_colors])
-        more, more_colors = place_unmatched(cameras, images, points)
+        more, more_colors = points_for_empty_cells(cameras, images, points)
         print(f"{len(more)} points where a view shows none of them", flush=True)
         points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
     kept = ~voting.points_inside(points, cameras, hidden)

@@ -104,7 +104,7 @@ def fit(
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
         control_density(optimizer, cameras, run.started_with, settings, run.iteration)
         average(optimizer, settings, run.iteration)
-        is_line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_TRACED_STEP)
+        is_line_due = trace.is_log_step(run.iteration, settings.iterations, first=FIRST_TRACED_STEP)
         is_checkpoint_due = checkpoints.due and run.iteration < settings.iterations
         _check_gaussians(optimizer.gaussians, i, camera, check_values=is_line_due or is_checkpoint_due)
         if is_line_due:
@@ -208,7 +208,7 @@ def _write_line(
     impl: Implementation,
 ) -> None:
     """Write a line of the trace and reset the sums of `run`; the time of this call does not count in "seconds"."""
-    with log.paused():
+    with log.pause():
         end = {"reason": "finished"} if run.iteration == settings.iterations else {}
         log.log(run.iteration, **_trace_values(run, held_out, images, settings, impl), **end)
     run.loss, run.error, run.steps = 0.0, 0.0, 0

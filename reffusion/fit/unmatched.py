@@ -23,7 +23,7 @@ FARTHER = 1.5  # factor by which a point moves away while another view sees past
 MAX_WITNESSES = 24  # number of views that are asked, so that time grows linearly with the views
 
 
-def place_unmatched(
+def points_for_empty_cells(
     cameras: Sequence[Camera], images: Mapping[str, np.ndarray], points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Add a point for each cell of a view that shows no point.

@@ -18,7 +18,7 @@ from reffusion import morphology
 from reffusion.background.mirrors import render_mirrors
 from reffusion.background.model import Background
 from reffusion.background.visibility import OPAQUE, DepthView, opaque_depth
-from reffusion.kernels.compiled import side_by_side, views_at_once
+from reffusion.kernels.compiled import map_in_threads, views_at_once
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
@@ -50,7 +50,7 @@ def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
         [camera.name for camera in background.cameras],
         views_at_once(background.mirrors[0].thing.means.device),
     )
-    return dict(zip(names, side_by_side(render, background.cameras, at_once), strict=True))
+    return dict(zip(names, map_in_threads(render, background.cameras, at_once), strict=True))
 
 
 def find_uncovered(
@@ -91,7 +91,7 @@ def find_uncovered(
     return dict(
         zip(
             [camera.name for camera in cameras],
-            side_by_side(find, cameras, views_at_once(gaussians.means.device)),
+            map_in_threads(find, cameras, views_at_once(gaussians.means.device)),
             strict=True,
         )
     )

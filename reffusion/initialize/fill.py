@@ -32,7 +32,7 @@ COMPLETION = CompletionSettings()
 
 
 @dataclass(frozen=True)
-class Filled:
+class ReferenceFill:
     """The result of adding one reference to a draft.
 
     Attributes:
@@ -92,7 +92,7 @@ def fill_reference(
     log: Trace | None = None,
     farthest: bool = False,
     share: Share | None = None,
-) -> Filled:
+) -> ReferenceFill:
     """Return the draft with one reference added, on the pixels of its mask that earlier references did not fill.
 
     Pixels of C (the object's mask) at which the draft is not opaque, or beside which another view would show a gap, are
@@ -135,12 +135,12 @@ def fill_reference(
     origin = EXTRA_VIEW if farthest else REFERENCE
     draft = unprojection.add_surface(draft, reference, surface.depth, pixels, background, sheets, origin)
     if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
-        return Filled(draft, surface.depth)
+        return ReferenceFill(draft, surface.depth)
     views = [(each, background.masks[each.name]) for each in background.cameras]
     gaps = unprojection.find_gaps(draft.gaussians, camera, surface.estimate, mask & ~pixels, views, GAP_ALPHA)
     if gaps.any():
         draft = unprojection.add_surface(draft, reference, surface.estimate, gaps, background, sheets)
-    return Filled(draft, surface.depth)
+    return ReferenceFill(draft, surface.depth)
 
 
 @dataclass(frozen=True)

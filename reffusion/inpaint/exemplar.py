@@ -27,7 +27,7 @@ from reffusion.inpaint.poisson import paste
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
 from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, PlaneSymmetry, find_symmetry
 from reffusion.inpaint.source_image import SourceImage
-from reffusion.kernels.compiled import side_by_side
+from reffusion.kernels.compiled import map_in_threads
 from reffusion.morphology import convex_hull, dilate, disk, to_pixels
 from reffusion.types import Camera
 
@@ -101,7 +101,7 @@ def complete_view(
         assembly = fill_plane(target, hole, sources, plane, symmetry)
         hole = hole & ~assembly.filled
         target = _with_filled(target, assembly.image, assembly.filled)
-    yield from side_by_side(lambda seed: complete(target, hole, sources, smooth, seed), seeds)
+    yield from map_in_threads(lambda seed: complete(target, hole, sources, smooth, seed), seeds)
 
 
 def _same_depth(depth: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -22,8 +22,8 @@ from reffusion import geometry, seeding
 from reffusion.background.plane_fit import search_planes
 from reffusion.background.visibility import OPAQUE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
-from reffusion.inpaint.source_image import without_geometry
-from reffusion.kernels.compiled import side_by_side
+from reffusion.inpaint.source_image import flat_source
+from reffusion.kernels.compiled import map_in_threads
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
@@ -120,7 +120,7 @@ def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0
     viewpoint = np.mean([camera.center for camera in cameras], axis=0)
     targets = [_visible_target(each, [other for other in maps if other is not each], viewpoint) for each in maps]
     continued = [(each, target) for each, target in zip(maps, targets, strict=True) if target.sum() >= MIN_CELLS]
-    painted = side_by_side(lambda pair: _paint(*pair, seed), continued)
+    painted = map_in_threads(lambda pair: _paint(*pair, seed), continued)
     for (each, target), colors in zip(continued, painted, strict=True):
         disks = _make_disks(each, target, colors, gaussians)
         extension = extension.zip_map(disks, lambda a, b: torch.cat([a, b]))
@@ -172,7 +172,7 @@ def _map_planes(
         return _observe(_empty_map(*plane, near, pixel_size, reach), views, cameras)
 
     maps = []
-    for index, plane_map in enumerate(side_by_side(observe, planes)):
+    for index, plane_map in enumerate(map_in_threads(observe, planes)):
         # a cell near an earlier plane counts as unseen, since it belongs to that plane
         for other, distance in planes[:index]:
             apart = np.abs(plane_map.centers @ other - distance) > CROSSING * INLIER * pixel_size
@@ -274,7 +274,7 @@ def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
     """Return [n, 3] in [0, 1], the colors of the n target cells, made of patches of the seen cells."""
     nearest = ndimage.distance_transform_edt(~plane_map.seen, return_distances=False, return_indices=True)
     image = (255 * plane_map.color[tuple(nearest)]).round().astype(np.uint8)  # the cells around must not be black
-    source = without_geometry(image, ~plane_map.seen)
+    source = flat_source(image, ~plane_map.seen)
     return complete(source, target, [source], seed=seed).image[target] / 255
 
 

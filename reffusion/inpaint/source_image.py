@@ -31,7 +31,7 @@ class SourceImage:
     plane_xy: np.ndarray
 
 
-def without_geometry(image: np.ndarray, hole: np.ndarray) -> SourceImage:
+def flat_source(image: np.ndarray, hole: np.ndarray) -> SourceImage:
     """Return an image whose surfaces are unknown: no planes, and pixels of one size.
 
     Args:

@@ -120,13 +120,13 @@ _ONE_FOCAL_LENGTH = (
 
 def _cameras_binary(path: Path) -> dict[int, ModelCamera]:
     file, cameras = Cursor(path), {}
-    for _ in range(file.count(40)):
+    for _ in range(file.read_count(40)):
         identity, model, width, height = file.read("IiQQ")
         if not 0 <= model < len(NAMES):
             raise BadInput(f"{path}: unknown camera model number {model}")
         params = file.read(f"{MODELS[NAMES[model]]}d")
         _add(cameras, identity, ModelCamera(NAMES[model], width, height, params), path)
-    file.end()
+    file.check_end()
     return cameras
 
 
@@ -179,10 +179,10 @@ def load_images(path: Path) -> dict[int, ModelImage]:
 
 def _images_binary(path: Path) -> dict[int, ModelImage]:
     file, images = Cursor(path), {}
-    for _ in range(file.count(73)):
+    for _ in range(file.read_count(73)):
         identity, *pose, camera_id = file.read("I7dI")
-        name = file.text()
-        seen = file.count(24)
+        name = file.read_text()
+        seen = file.read_count(24)
         file.at += 24 * seen
         _add(
             images,
@@ -190,7 +190,7 @@ def _images_binary(path: Path) -> dict[int, ModelImage]:
             ModelImage(_check_name(name, path), camera_id, quaternion_to_pose(pose[:4], pose[4:])),
             path,
         )
-    file.end()
+    file.check_end()
     return images
 
 
@@ -236,7 +236,7 @@ def load_model_points(path: Path) -> ModelPoints:
 
 def _points_binary(path: Path) -> ModelPoints:
     file = Cursor(path)
-    count = file.count(POINT.itemsize)
+    count = file.read_count(POINT.itemsize)
     # The length of a record depends on the length of its track. So this loop only finds where each record starts, and
     # numpy reads all records at once afterwards.
     starts, at, track_at = np.empty(count, np.int64), file.at, POINT.itemsize - 8
@@ -246,7 +246,7 @@ def _points_binary(path: Path) -> ModelPoints:
         if at > len(file.data):
             raise BadInput(f"{path}: cut off at byte {len(file.data)}")
     file.at = at
-    file.end()
+    file.check_end()
     data = np.frombuffer(file.data, np.uint8)
     records = data[starts[:, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
     lengths = records["track"].astype(np.int64)

@@ -118,23 +118,23 @@ class Cursor:
     def read(self, layout: str) -> tuple:
         """Read values in a layout of the module `struct`, without byte order, and advance."""
         layout = "<" + layout
-        self.need(1, struct.calcsize(layout))
+        self.check_left(1, struct.calcsize(layout))
         values = struct.unpack_from(layout, self.data, self.at)
         self.at += struct.calcsize(layout)
         return values
 
-    def need(self, count: int, size: int) -> None:
+    def check_left(self, count: int, size: int) -> None:
         """Raise BadInput if fewer than `count` records of `size` bytes follow. Nothing is read."""
         if self.at + count * size > len(self.data):
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
 
-    def count(self, size: int) -> int:
+    def read_count(self, size: int) -> int:
         """Read a number of records (uint64), and check that so many records of at least `size` bytes can follow."""
         (count,) = self.read("Q")
-        self.need(count, size)
+        self.check_left(count, size)
         return count
 
-    def text(self) -> str:
+    def read_text(self) -> str:
         """Read text that ends with a zero byte, and advance beyond this byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
@@ -142,7 +142,7 @@ class Cursor:
         name, self.at = self.data[self.at : end].decode(), end + 1
         return name
 
-    def end(self) -> None:
+    def check_end(self) -> None:
         """Raise BadInput if bytes are left."""
         if self.at != len(self.data):
             raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes too many at its end; write the model again")

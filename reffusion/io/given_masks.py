@@ -84,10 +84,10 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
     elif path.suffix.lower() == ".npy":
         array = _load_array(path)
         with as_bad_input(path, "a readable mask"):
-            mask = np.isin(array, values.ids) if values.ids else _marked_pixels(path, array[..., None], True)
+            mask = np.isin(array, values.ids) if values.ids else _mark_by_colors(path, array[..., None], True)
     else:
         with open_image(path, "a readable mask") as image:
-            mask = _numbered_pixels(path, image, values.ids) if values.ids else _find_marked_pixels(path, image)
+            mask = _numbered_pixels(path, image, values.ids) if values.ids else _mark_by_picture(path, image)
     mask = mask ^ values.inverted
     return mask if size is None else resize_nearest(mask, size)
 
@@ -121,21 +121,21 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
     return np.isin(array, ids) & opaque
 
 
-def _find_marked_pixels(path: Path, image: Image.Image) -> np.ndarray:
-    """Return the pixels, bool [H, W], that a picture's alpha or colors mark; raises BadInput as `load_given_mask`."""
+def _mark_by_picture(path: Path, image: Image.Image) -> np.ndarray:
+    """Return the pixels, bool [H, W], that a picture marks by alpha if that cuts out a photograph, else by colors."""
     lossless, palette = image.format != "JPEG", image.mode in ("P", "PA")
     if image.mode[0] in "IF" or not image.has_transparency_data:
         array = np.array(image if image.mode[0] in "IF1L" and image.mode != "LAB" else image.convert("RGB"))
-        return _marked_pixels(path, array.reshape(*array.shape[:2], -1), lossless, palette)
+        return _mark_by_colors(path, array.reshape(*array.shape[:2], -1), lossless, palette)
     array = np.array(image.convert("RGBA"))
     colors, opaque = array[..., :3], array[..., 3] >= 128
     if not np.ptp(array[..., 3]):
-        return _marked_pixels(path, colors, lossless, palette)
+        return _mark_by_colors(path, colors, lossless, palette)
     if (colors == colors[0, 0]).all():
         raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
     if opaque.any() and not _is_drawing(colors[opaque], lossless):
         return opaque
-    return _marked_pixels(path, colors * opaque[..., None], lossless, palette)
+    return _mark_by_colors(path, colors * opaque[..., None], lossless, palette)
 
 
 def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
@@ -147,7 +147,7 @@ def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
     return levels.low <= 2 * DARK and levels.share >= 0.9 and levels.is_one_color
 
 
-def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool = False) -> np.ndarray:
+def _mark_by_colors(path: Path, colors: np.ndarray, lossless: bool, palette: bool = False) -> np.ndarray:
     """Return the pixels, bool [H, W], that colors mark; raises BadInput for several objects or a photograph."""
     # `colors` is [H, W, C] of any type, C = 1 or 3. The colors of a JPEG (not `lossless`) are not exact. The entries
     # of a palette may be named as `masks: {id: ...}`.

@@ -178,11 +178,11 @@ def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) 
 
 
 def views_at_once(device: str | torch.device) -> int:
-    """Return how many views to process `side_by_side`: one on a GPU, which a single view occupies."""
+    """Return how many views to process `map_in_threads`: one on a GPU, which a single view occupies."""
     return MAX_VIEWS if torch.device(device).type == "cpu" else 1
 
 
-def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
+def map_in_threads(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
     """Yield `function(item)` for each item, in order; several items are computed at once, each in one thread.
 
     This is useful for functions whose array operations release the GIL. Torch's threads are divided among the items. If

@@ -98,8 +98,13 @@ def _as_vector(context, builder, value, have, want):
 
 
 def _register_operator(symbol, emit, kind, result):
-    """Register a binary operator in numba for vectors; emit(builder, x, y) writes its LLVM instruction."""
-    # On one side a number may stand instead of a vector, but not for masks.
+    """Register a binary operator in numba for two vectors, or a vector and a number unless vectors are masks.
+
+    Args:
+        symbol: the operator, as `operator.add`.
+        emit: emit(builder, x, y) writes the LLVM instruction.
+        kind, result: numba types of the vectors and of the result.
+    """
     pairs = [(kind, kind)]
     if kind != lane_mask:
         pairs += [pair for number in (types.float32, types.float64) for pair in ((kind, number), (number, kind))]

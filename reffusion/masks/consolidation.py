@@ -21,7 +21,7 @@ from reffusion.background import training_coverage
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
 from reffusion.background.visibility import opaque_depth
-from reffusion.kernels.compiled import side_by_side, views_at_once
+from reffusion.kernels.compiled import map_in_threads, views_at_once
 from reffusion.masks import regions, voting
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.voting import Votes
@@ -162,7 +162,7 @@ def classify_pixels(
         invent = invent | fill.render(camera, found.depth)
         return MaskSet(given, mask, unobserved, invent)
 
-    with closing(side_by_side(classify, names, views_at_once(params.device))) as found:
+    with closing(map_in_threads(classify, names, views_at_once(params.device))) as found:
         return {names[k]: next(found) for k in trace.progress(len(names), "masks")}
 
 

@@ -36,7 +36,7 @@ def explain_misplacement(
         rendering = rasterizer.render(gaussians, small)
         photo = cv2.resize(photos[camera.name], (small.width, small.height), interpolation=cv2.INTER_AREA)
         coverage.append(float((rendering.alpha > 0.5).float().mean()))
-        correlation.append(_correlate(_detail(rendering.color.cpu().numpy()), _detail(photo / np.float32(255))))
+        correlation.append(_cosine(_detail(rendering.color.cpu().numpy()), _detail(photo / np.float32(255))))
     if np.median(coverage) < MIN_COVERAGE:
         share = np.median(coverage)
         return f"the cameras see hardly anything of them ({share:.0%} of a view): they are in another frame"
@@ -54,7 +54,7 @@ def _detail(image: np.ndarray) -> np.ndarray:
     return gray - cv2.GaussianBlur(gray, (0, 0), LOW_PASS * gray.shape[1])
 
 
-def _correlate(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the normalised correlation of two images in [-1, 1]; 1 if one of them is zero everywhere."""
+def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine of two images in [-1, 1], whose means are not subtracted; 1 if one of them is zero."""
     scale = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum()) / scale if scale > 0 else 1.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from reffusion import trace
 from reffusion.background import training_coverage
-from reffusion.kernels.compiled import side_by_side, views_at_once
+from reffusion.kernels.compiled import map_in_threads, views_at_once
 from reffusion.metrics import leftovers, rows
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.view_renders import ViewRenders
@@ -88,7 +88,7 @@ def score_in_order(
     """
     scored: list[dict[str, Any]] = []
     previous = None
-    with closing(side_by_side(evaluate_view, names, views_at_once(device))) as views:
+    with closing(map_in_threads(evaluate_view, names, views_at_once(device))) as views:
         for _ in trace.progress(len(names), "evaluate"):
             view, row = next(views)
             if previous:

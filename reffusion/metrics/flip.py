@@ -109,12 +109,15 @@ def _max_color_difference() -> float:
     return float(_hyab_distance(green, blue)[0, 0] ** COLOR_POWER)
 
 
-def _redistribute(error: np.ndarray) -> np.ndarray:
-    """Map color differences [H, W] to [0, 1] by a piecewise linear function with a knee at `KNEE`."""
+def _redistribute(power: np.ndarray) -> np.ndarray:
+    """Map color differences, raised to `COLOR_POWER`, [H, W], to [0, 1] by two lines that meet at `KNEE`.
+
+    The first number of `KNEE` is a share of the largest difference.
+    """
     largest, (knee, share) = _max_color_difference(), KNEE
-    below = error * (share / (knee * largest))
-    above = share + (error - knee * largest) / ((1 - knee) * largest) * (1 - share)
-    return np.where(error < knee * largest, below, above)
+    below = power * (share / (knee * largest))
+    above = share + (power - knee * largest) / ((1 - knee) * largest) * (1 - share)
+    return np.where(power < knee * largest, below, above)
 
 
 def _edge_and_point_features(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

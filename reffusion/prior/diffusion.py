@@ -212,17 +212,17 @@ def sample(
     batch = torch.full((len(images),), times[0], device=images.device)
     noisy = noise if start == 1 else add_noise(prior, encode(prior, images), noise, batch)
     for t, next_t in itertools.pairwise(times):
-        eps, clean = guided(prior, noisy, torch.full_like(batch, t), condition, text, empty, guidance)
+        eps, clean = predict_with_guidance(prior, noisy, torch.full_like(batch, t), condition, text, empty, guidance)
         noisy = clean if next_t == times[-1] else add_noise(prior, clean, eps, torch.full_like(batch, next_t))
     return shown.restore(decode(prior, noisy)).clamp(-1, 1)
 
 
-def guided(
+def predict_with_guidance(
     prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor, empty: Tensor | None, guidance: float
 ) -> tuple[Tensor, Tensor]:
     """Return eps and z_0 with classifier-free guidance, (1 + γ) ε(cond) - γ ε(empty), in one batch of the UNet.
 
-    If the prompt itself is empty, the result is eps(empty) for every a, and the UNet runs for this prompt only.
+    If the prompt itself is empty, the result is eps(empty) for every γ, and the UNet runs for this prompt only.
 
     Args:
         prior: The diffusion prior.

@@ -85,7 +85,7 @@ def personalize(
     references = [replace(each, image=each.image.to(prior.device)) for each in references]
 
     def measure(step: int, previous: float = inf) -> tuple[float, bool]:
-        with log.paused():
+        with log.pause():
             errors = measure_errors(prior, validation_set, settings.prompts.texts, settings.seed)
             error = errors["clean_latent_mse"]
             is_settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
@@ -96,7 +96,7 @@ def personalize(
     # The embedded prior's tensors are so small that a second thread delays.
     with torch_on_one_thread() if prior.device.type == "cpu" else nullcontext():
         for step in trace.progress(steps, "personalize", start):
-            if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
+            if trace.is_log_step(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
                 error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
                 if is_settled:
                     break

@@ -118,7 +118,7 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
     known = ~_dilate(hidden, MARGIN)
     untouched = known.any() and np.median(np.abs(picture.astype(np.int16) - photo)[known]) <= IDENTICAL
     pair = _Pair.at(picture, photo, known, working)
-    best = unmoved = pair.judge(IDENTITY)
+    best = identity_comparison = pair.judge(IDENTITY)
     if untouched and best.fits:
         return replace(best, affine=None, gain=np.ones(3), offset=np.zeros(3), is_identical=True)
     for start in pair.starts():
@@ -126,7 +126,7 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
         best = found if found is not None and _is_better(found, best) else best
         if best.inlier_ratio > SURE_INLIER_RATIO:
             break
-    return best if best.max_shift > IDENTITY_SHIFT * pair.stride.max() else replace(unmoved, affine=None)
+    return best if best.max_shift > IDENTITY_SHIFT * pair.stride.max() else replace(identity_comparison, affine=None)
 
 
 def find_better_view(
@@ -226,7 +226,7 @@ class _Pair:
         return Registration(full, shift, gain, offset, places, in_place, displaced, is_identical=False)
 
     @cached_property
-    def unmoved(self) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
+    def identity_comparison(self) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
         """The result of `compare` for the identity."""
         return self._compare(self.picture, self.known)
 
@@ -238,7 +238,7 @@ class _Pair:
             points of the photograph to the places where the resampled picture shows them.
         """
         if moved is IDENTITY:
-            return self.unmoved
+            return self.identity_comparison
         read, inside = warp(self.picture, moved)
         return self._compare(read, self.known & inside)
 

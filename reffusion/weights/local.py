@@ -34,8 +34,7 @@ class Need:
         name: a hub id, a path, or a text for messages such as `LPIPS_NAME`. It tells `fetch` what to download.
         problem: why the weights cannot be used, in most cases with a remedy; None if they can be used.
         bytes: size of the weights, or of their download; None if unknown.
-        fetched: True if `make weights` can download the weights when there is a problem. It has no meaning if there is
-            none.
+        can_download: whether `make weights` can mend the problem by a download. It has no meaning without a problem.
         optional: True if the stage works without the weights and reports what it leaves out.
         half: True if weights in half precision are sufficient.
         files: the only files of the hub model that are needed; empty for all that diffusers or transformers reads.
@@ -45,14 +44,16 @@ class Need:
     name: str
     problem: str | None
     bytes: int | None = None
-    fetched: bool = True
+    can_download: bool = True
     optional: bool = False
     half: bool = False
     files: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()
 
     def fetch(self) -> None:
-        """Download the weights and check them. May be called only if `fetched` is True and there is a problem.
+        """Download the weights and check them. May be called only if there is a problem and `can_download`.
+
+        The need itself does not change: ask for it again.
 
         Raises:
             ValueError: the download failed, or the weights are not the expected ones. The message has one line.
@@ -92,7 +93,7 @@ def _need(source: str | Path, dtype: str, check_folder: Callable[[Path], object]
         if folder is not None:
             check_folder(folder)
     except ValueError as error:
-        return Need(str(source), str(error), size, fetched=False)
+        return Need(str(source), str(error), size, can_download=False)
     if folder is None:
         problem = explain_missing(source)
     return Need(str(source), problem, size, half=half)

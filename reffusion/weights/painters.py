@@ -69,11 +69,11 @@ def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
         file = find_file(inpainter)
     except ValueError as error:
         if inpainter.weights:
-            return [Need(published.name, f"{param}: {error}", fetched=False)]
+            return [Need(published.name, f"{param}: {error}", can_download=False)]
         return [Need(published.repo, f"{param}: {error}", published.bytes, files=(published.file,))]
     lacks_runtime = file.suffix == ".onnx" and importlib.util.find_spec("onnxruntime") is None
     problem = f"{param}: {file.name} needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
-    return [Need(str(file), problem, file.stat().st_size, fetched=False)]
+    return [Need(str(file), problem, file.stat().st_size, can_download=False)]
 
 
 def name_seed_painter(inpainter: Inpainter) -> str:
@@ -108,7 +108,7 @@ def reference_needs(inpainter: Inpainter, dtype: str, param: str = "reference.in
     if inpainter.kind == "command":
         program = split_command(str(inpainter.command))[0]
         problem = None if shutil.which(program) else f"{param}: {program} is no program that can be started here"
-        return [Need(program, problem, fetched=False)]
+        return [Need(program, problem, can_download=False)]
     if inpainter.kind != "moebius":
         return weights_needs(inpainter, param)
     lacks_runtime = importlib.util.find_spec("onnxruntime") is None
@@ -116,10 +116,10 @@ def reference_needs(inpainter: Inpainter, dtype: str, param: str = "reference.in
     try:
         folder = find_moebius(inpainter)
     except ValueError as error:
-        fetched = not (inpainter.weights or lacks_runtime)
-        return [Need(MOEBIUS.repo, problem or f"{param}: {error}", MOEBIUS.bytes, fetched, files=MOEBIUS.files)]
+        can_download = not (inpainter.weights or lacks_runtime)
+        return [Need(MOEBIUS.repo, problem or f"{param}: {error}", MOEBIUS.bytes, can_download, files=MOEBIUS.files)]
     size = sum((folder / name).stat().st_size for name in MOEBIUS.files)
-    return [Need(str(folder), problem, size, fetched=False)]
+    return [Need(str(folder), problem, size, can_download=False)]
 
 
 def reference_facts(inpainter: Inpainter) -> dict[str, str]:

@@ -147,6 +147,7 @@ class _Addresses:
         return JSONResponse({"port": viewer.port})
 
     def send_picture(self, request: Request) -> Response:
+        """Send the picture of a view of one of the kinds `PICTURES`; browsers keep it if the address has a query."""
         scene, kind, view = self._scene(request), request.path_params["kind"], request.path_params["view"]
         if kind not in PICTURES or view not in scene.pictures():
             raise LookupError("no such picture")

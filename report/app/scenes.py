@@ -110,7 +110,7 @@ def _find_lost(text: str, runs: Path) -> Path | None:
 
 
 def list_recent(runs: Path) -> list[dict[str, object]]:
-    """Return the `MAX_RECENT` scenes that changed last: those that ran in `runs`, and captures and videos of data/.
+    """Return the `MAX_RECENT` scenes of `runs` and data/ whose folders changed last, latest first.
 
     Variants of a scene are left out.
 

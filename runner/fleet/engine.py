@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from runner import Refused, process, say
-from runner.durations import earlier_receipts
+from runner.durations import receipts_of_variants
 from runner.files import list_files
 from runner.process import Resources, StageResult, Task, run_process
 from runner.resolve import ResolvedJob
@@ -163,7 +163,7 @@ def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | Non
         stage: name of the stage.
         needs: need -> folder; None if the need is skipped.
     """
-    if peaks := [r["peak_memory_mb"] for r in earlier_receipts(job, stage) if r.get("peak_memory_mb")]:
+    if peaks := [r["peak_memory_mb"] for r in receipts_of_variants(job, stage) if r.get("peak_memory_mb")]:
         return round(1.1 * max(peaks))
     each = job.pipeline.memory.get(stage)
     read = (path for folder in needs.values() if folder for path in list_files(folder))

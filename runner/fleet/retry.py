@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from runner.artifacts import take_over
+from runner.artifacts import restore_from_attempt
 from runner.process import StageResult, Task, run_process
 
 
@@ -25,7 +25,7 @@ def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> St
     """
     out = Path(task.line["out"])
     own = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
-    take_over(out)
+    restore_from_attempt(out)
     out.mkdir(parents=True, exist_ok=True)
     out.rename(own)
     try:

@@ -39,15 +39,15 @@ def fetch_weights(request: "Request", offline: bool) -> int:
     needs = {need["name"]: need for _, need in all_needs}
     users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
     missing = [need for need in needs.values() if need["problem"]]
-    to_fetch = [need for need in missing if need["fetched"]]
+    to_fetch = [need for need in missing if need["can_download"]]
     print(f"weights of profile {job.profile} ({job.why})")
     for name, need in needs.items():
-        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "not usable"
+        state = "here" if not need["problem"] else "to fetch" if need["can_download"] else "not usable"
         print(f"  {state:<10} {format_bytes(need['bytes']):>12}  {name}  ({users[name]})")
     _print_problems(missing)
     unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
     print(f"to fetch: about {format_bytes(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
-    unusable = sum(not need["fetched"] and not need["optional"] for need in missing)
+    unusable = sum(not need["can_download"] and not need["optional"] for need in missing)
     if offline or not to_fetch:
         return unusable + sum(not need["optional"] for need in to_fetch)
     process = start_worker(request.root, module="runner.fleet.weights")
@@ -58,7 +58,7 @@ def fetch_weights(request: "Request", offline: bool) -> int:
 def _print_problems(missing: list[dict[str, Any]]) -> None:
     """Print why missing weights (dicts of `weights.local.Need`) cannot be downloaded, and where each was searched."""
     for need in missing:
-        if not need["fetched"]:
+        if not need["can_download"]:
             print(f"error: {need['problem']}", file=sys.stderr)
     for places in dict.fromkeys(tuple(need.get("folders", ())) for need in missing):
         names = [need["name"] for need in missing if tuple(need.get("folders", ())) == places]
@@ -85,7 +85,7 @@ def fetch() -> int:
             more = planned.optional_weights(params)
             optional |= {need.name for need in more} - {need.name for need in needs}
             needs += more
-        downloads |= {need.name: need for need in needs if need.problem and need.fetched}
+        downloads |= {need.name: need for need in needs if need.problem and need.can_download}
     failed = 0
     for need in downloads.values():
         try:

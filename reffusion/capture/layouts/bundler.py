@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture, Correction, PointCloud
-from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.layouts.placed import PictureCamera, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, is_file, reading
 
@@ -49,12 +49,12 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
     return read_placed(folder, images, "bundler", source, placed, correction, points)
 
 
-def _placed(numbers: np.ndarray) -> Placed:
+def _placed(numbers: np.ndarray) -> PictureCamera:
     """Return a camera of bundle.out, [5, 3]: focal length and two radial coefficients, rotation, translation."""
     (focal, k1, k2), world_to_camera = (float(n) for n in numbers[0]), np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = FLIP @ numbers[1:4], FLIP @ numbers[4]
     at = lambda size: Lens(*size, focal, focal, size[0] / 2, size[1] / 2, radial=(k1, k2), model="RADIAL")
-    return Placed(world_to_camera, at)
+    return PictureCamera(world_to_camera, at)
 
 
 def _read_points(rows: list[list[str]], count: int) -> PointCloud:

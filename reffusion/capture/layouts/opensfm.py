@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture, Correction, PointCloud
-from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.layouts.placed import PictureCamera, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput, as_bad_input, is_file, shorten
@@ -41,14 +41,14 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
     return read_placed(folder, images, "opensfm", source, placed, correction, points)
 
 
-def _place(shot: dict[str, Any], lens: Lens) -> Placed:
+def _place(shot: dict[str, Any], lens: Lens) -> PictureCamera:
     """Return the camera of a shot, whose rotation is a vector: an axis, as long as the angle in radians."""
     import cv2
 
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = cv2.Rodrigues(np.array(shot["rotation"], np.float64))[0]
     world_to_camera[:3, 3] = shot["translation"]
-    return Placed(world_to_camera, lambda _: lens)
+    return PictureCamera(world_to_camera, lambda _: lens)
 
 
 def _parse_lens(values: dict[str, Any], name: str, source: Path) -> Lens:

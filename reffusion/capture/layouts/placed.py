@@ -30,7 +30,7 @@ USUAL = ("images", "images_2", "images_4", "images_8", "photos", "input", "rgb",
 
 
 @dataclass(frozen=True)
-class Placed:
+class PictureCamera:
     """The camera of a picture in another program's file.
 
     Attributes:
@@ -48,7 +48,7 @@ def read_placed(
     images: str | None,
     layout: str,
     source: Path,
-    placed: Mapping[str, Placed],
+    placed: Mapping[str, PictureCamera],
     correction: Correction,
     points: PointCloud = NO_POINTS,
     usual: Sequence[str] = USUAL,
@@ -108,7 +108,7 @@ def read_placed(
     )
 
 
-def _check_lens(placed: Placed, picture: Path, source: Path) -> Lens:
+def _check_lens(placed: PictureCamera, picture: Path, source: Path) -> Lens:
     """Return the lens of a picture. Raises BadInput if a size or focal length is not positive, or a number infinite."""
     lens = placed.lens(image_size(picture))
     numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial, *lens.tangential)

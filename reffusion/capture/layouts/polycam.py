@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture, Correction, has_pictures, invert_pose
-from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.layouts.placed import PictureCamera, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_json
 from reffusion.io.files import as_bad_input
@@ -38,7 +38,7 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
     return read_placed(folder, images, "polycam", source, placed, correction, usual=(usual,))
 
 
-def _load_camera(path: Path) -> Placed:
+def _load_camera(path: Path) -> PictureCamera:
     values = load_json(path)
     with as_bad_input(path, "a camera of Polycam"):
         camera_to_world = np.eye(4)
@@ -52,4 +52,4 @@ def _load_camera(path: Path) -> Placed:
         is_scaled = abs(centered[0] / size[0] - 1) > OFF_CENTER
         return Lens(*(stored or (centered if is_scaled else size)), fx, fy, cx, cy)
 
-    return Placed(invert_pose(camera_to_world @ FLIP), lens_at)
+    return PictureCamera(invert_pose(camera_to_world @ FLIP), lens_at)

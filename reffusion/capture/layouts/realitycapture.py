@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture, Correction, invert_pose
-from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.layouts.placed import PictureCamera, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, as_bad_input, reading
 
@@ -61,7 +61,7 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
     return read_placed(folder, images, "realitycapture", source, placed, correction)
 
 
-def _parse_row(row: dict[str, str], source: Path, line: int) -> Placed:
+def _parse_row(row: dict[str, str], source: Path, line: int) -> PictureCamera:
     with as_bad_input(source, f"readable in line {line}"):
         number = lambda name: float(row.get(name) or 0.0)
         focal, center = float(row["f"]), (number("px"), number("py"))
@@ -75,7 +75,7 @@ def _parse_row(row: dict[str, str], source: Path, line: int) -> Placed:
         f, cx, cy = focal / 36 * longer, width / 2 + center[0] * longer, height / 2 + center[1] * longer
         return Lens(width, height, f, f, cx, cy, tuple(radial), tangential=tangential, model="RealityCapture")
 
-    return Placed(invert_pose(camera_to_world), lens)
+    return PictureCamera(invert_pose(camera_to_world), lens)
 
 
 def _rotation(heading: float, pitch: float, roll: float) -> np.ndarray:

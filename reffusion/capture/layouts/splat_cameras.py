@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture, Correction, invert_pose
-from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.layouts.placed import PictureCamera, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput, as_bad_input, is_file
@@ -35,9 +35,9 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
     return read_placed(folder, images, "3dgs", source, placed, correction)
 
 
-def _parse_camera(values: dict) -> Placed:
+def _parse_camera(values: dict) -> PictureCamera:
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3], camera_to_world[:3, 3] = values["rotation"], values["position"]
     width, height = int(values["width"]), int(values["height"])
     lens = Lens(width, height, float(values["fx"]), float(values["fy"]), width / 2, height / 2)
-    return Placed(invert_pose(camera_to_world), lambda _: lens)
+    return PictureCamera(invert_pose(camera_to_world), lambda _: lens)

@@ -169,7 +169,7 @@ def evaluate_sds(
     noise = torch.randn(latents.shape, generator=generator).to(latents)
     gradient = sds_gradient(
         latents,
-        lambda noisy, t: diffusion.guided(prior, noisy, t, condition, prompts, empty, sds.guidance),
+        lambda noisy, t: diffusion.predict_with_guidance(prior, noisy, t, condition, prompts, empty, sds.guidance),
         timesteps,
         noise,
         prior.alphas_cumprod,

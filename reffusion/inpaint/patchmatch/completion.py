@@ -19,7 +19,7 @@ from scipy import ndimage
 from reffusion import seeding
 from reffusion.inpaint.classical import blank_hole, telea
 from reffusion.inpaint.patchmatch import search, voting
-from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Hole, Level, Matches, Positions, Sources
+from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Hole, Matches, Positions, PyramidLevel, Sources
 from reffusion.inpaint.plane_frames import invert_2x2
 from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.source_image import SourceImage
@@ -82,7 +82,7 @@ def complete(
     for k, (current, mask, level_sources) in enumerate(pyramid):
         first, last = k == 0, k == len(pyramid) - 1
         hole_pixels = _gather_hole(target, mask, 2 ** (len(pyramid) - 1 - k), smooth, level_sources)
-        level = Level(hole_pixels, level_sources, current, _trust(mask))
+        level = PyramidLevel(hole_pixels, level_sources, current, _trust(mask))
         positions = _patch_positions(level_sources, int(hole_pixels.plane.max()))
         if matches is None or coarser is None:  # the coarsest level
             matches = _first_layout(level, mask, positions, state)
@@ -101,7 +101,7 @@ def complete(
     return Completion(_blend_patches(target.image, hole, level, matches), misfit)
 
 
-def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: Matches) -> np.ndarray:
+def _blend_patches(image: np.ndarray, hole: np.ndarray, level: PyramidLevel, matches: Matches) -> np.ndarray:
     """Return the image, uint8 [H, W, 3], with the hole filled without seams by the patches' gradients."""
     own = level.current[..., :3].copy()  # becomes the color at the center of each pixel's patch
     right, below = np.zeros_like(own), np.zeros_like(own)
@@ -221,7 +221,7 @@ def _trust(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, np.maximum(TRUST_FALLOFF ** -_distance_inside(mask), MIN_TRUST), 1).astype(np.float32)
 
 
-def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: np.ndarray) -> Matches:
+def _first_layout(level: PyramidLevel, mask: np.ndarray, positions: Positions, state: np.ndarray) -> Matches:
     """Find the matches at the coarsest level and fill `level.current` in place, ring by ring from the hole's border."""
     row, column, trust = level.hole.row, level.hole.column, level.weight
     count = len(row)
@@ -239,7 +239,7 @@ def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: n
     return matches
 
 
-def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
+def _from_coarser(matches: Matches, coarser: Hole, level: PyramidLevel) -> Matches:
     """Convert the matches of the coarser level to this level: each pixel inherits the match of its coarser pixel."""
     (height, width), hole = coarser.index.shape, level.hole
     row, column = np.minimum(hole.row // 2, height - 1), np.minimum(hole.column // 2, width - 1)
@@ -250,7 +250,9 @@ def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
     return result
 
 
-def _vote(level: Level, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
+def _vote(
+    level: PyramidLevel, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None
+) -> None:
     """Set the first `VOTED` channels of hole pixels `todo` (None: all) to the weighted mean of covering patches."""
     todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
     # the weight of a patch falls by a factor of e per `spread` of misfit

@@ -58,7 +58,7 @@ class Hole(NamedTuple):
     pixel_size: np.ndarray
 
 
-class Level(NamedTuple):
+class PyramidLevel(NamedTuple):
     """One level of the image pyramid.
 
     Attributes:

@@ -56,7 +56,7 @@ def misfit(n, along_plane, source, y, x, angle, limit, level):
         source, y, x: index of the source image, and row and column of the patch's center.
         angle: radians by which the patch is turned in its plane.
         limit: the largest misfit of interest, for example that of the present patch.
-        level: `Level`.
+        level: `PyramidLevel`.
 
     Returns:
         The squared Euclidean difference of the features, as a weighted mean over the patch's pixels, times the penalty
@@ -177,7 +177,7 @@ def search(todo, rounds, tries, matches, level, positions, state):
         rounds: number of passes over the pixels.
         tries: number of random places anywhere, per pixel and round.
         matches: `Matches`, changed in place.
-        level: `Level`.
+        level: `PyramidLevel`.
         positions: `Positions`, the places from which random places are drawn.
         state: [1] uint64, state of the random numbers, changed in place.
     """
