@@ -5,6 +5,7 @@ It imports nothing of the editor.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import threading
 from pathlib import Path
@@ -84,8 +85,9 @@ class FillJob:
         command = [program, "patch", str(folder / "before.ply"), str(folder / "after.ply"), "--out", str(self.out)]
         command += ["--cameras", cameras] if cameras else []
         merged = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
+        environment = os.environ | {"PYTHONUNBUFFERED": "1"}  # each line arrives when it is printed
         try:
-            self._process = subprocess.Popen(command, cwd=folder, **merged)
+            self._process = subprocess.Popen(command, cwd=folder, env=environment, **merged)
         except OSError as error:
             raise ValueError(
                 f"{program or 'reffusion'} cannot be started ({error.strerror}): name the command"
