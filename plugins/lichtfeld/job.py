@@ -92,7 +92,8 @@ class FillJob:
             raise ValueError(
                 f"{program or 'reffusion'} cannot be started ({error.strerror}): name the command"
             ) from None
-        threading.Thread(target=self._read_lines, daemon=True).start()
+        self._reader = threading.Thread(target=self._read_lines, daemon=True)
+        self._reader.start()
 
     def _read_lines(self) -> None:
         with (self.out.parent / "log.txt").open("w") as log:
@@ -102,8 +103,8 @@ class FillJob:
                 self.line = line.strip() or self.line
 
     def poll(self) -> int | None:
-        """Return the exit status of the program, or None while it runs."""
-        return self._process.poll()
+        """Return the exit status of the program, or None while it runs or prints."""
+        return None if self._reader.is_alive() else self._process.wait()
 
     def stop(self) -> None:
         """Interrupt the program. What it has computed stays in its folder."""
