@@ -419,6 +419,21 @@ def test_the_cap_grows_linearly_or_holds_from_the_start(growth, number):
     assert len(optimizer.gaussians) == number
 
 
+def test_a_gaussian_is_split_from_a_hundredth_of_the_distance_or_of_the_cameras_extent_on():
+    """The extent of these cameras is 0.55: a Gaussian of 0.008 is large by it, and small beside its distance 1."""
+    cameras = [make_camera(f"{x}", (16, 16), 16.0, center=(x, 0.0, 0.0)) for x in (-0.5, 0.5)]
+    smallest = {}
+    for unit in ("distance", "cameras"):
+        settings = Params(iterations=10, densify=Densify(start=0, every=1, stop=1, size_unit=unit, reset_every=0))
+        optimizer = GaussianOptimizer(round_gaussians(torch.tensor([[0.0, 0, 1]]), torch.full((1, 3), 0.5), 2.0, 2.0))
+        optimizer.gaussians.log_scales.data[:] = math.log(0.008)
+        optimizer.grad2d_sum, optimizer.grad2d_count = torch.ones(1), torch.ones(1)
+        control_density(optimizer, cameras, 9, settings, 4)
+        assert len(optimizer.gaussians) == 2
+        smallest[unit] = float(optimizer.gaussians.log_scales.detach().exp().min())
+    assert smallest["distance"] == pytest.approx(0.008) and smallest["cameras"] == pytest.approx(0.008 / 1.6)
+
+
 def test_sizes_are_measured_in_the_distance_or_in_the_cameras_extent():
     """A Gaussian far behind the others is pruned in units of the cameras' extent, and kept in units of its distance.
 
