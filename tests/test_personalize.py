@@ -169,6 +169,15 @@ def test_training_learns_the_reference_and_logs_it(fresh_prior, tmp_path):
     assert not fresh_prior.unet.training
 
 
+def test_training_reads_the_prompts_of_the_stage(fresh_prior, tmp_path, monkeypatch):
+    used, embed = [], P.diffusion.embed_text
+    monkeypatch.setattr(P.diffusion, "embed_text", lambda prior, texts: used.append(list(texts)) or embed(prior, texts))
+    trained = lora.attach(fresh_prior, 4, 8, 0.0, "attention", 0)
+    training = with_changes(TRAINING, steps=1, prompts={"whole": "a wall", "crop": "a brick"})
+    P.personalize(fresh_prior, trained, [striped_reference()], training, tmp_path)
+    assert used and all(texts[:2] == ["a wall", "a brick"] for texts in used)
+
+
 def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
     """Photographs serve validation only: the trained weights are the same with and without them.
 
