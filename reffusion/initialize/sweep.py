@@ -115,8 +115,8 @@ def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthVi
     angles = [
         np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views
     ]
-    # The angle, in degrees, is the one at the point between the camera and the view. The views are spread over the
-    # range by increasing angle.
+    # The angle, in degrees, is the one at the point between the camera and the view. From twice
+    # `NEIGHBORS` views on, every second or further one is taken, by increasing angle.
     chosen = sorted(
         (angle, k)
         for k, angle in enumerate(angles)

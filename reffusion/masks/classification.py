@@ -154,8 +154,9 @@ def complete_object(
     if not (params.remnants and has_masks):
         return labels, consistent, depths, []
     remnants = find_remnants(gaussians, labels, [camera for camera in train if camera.name in dirty])
-    for remnant in (each for each in remnants if each.would_float):
-        labels = labels | torch.as_tensor(remnant.members, device=labels.device)
+    floating = [torch.as_tensor(each.members, device=labels.device) for each in remnants if each.would_float]
+    if floating:
+        labels = torch.stack([labels, *floating]).any(0)
         consistent, depths = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     return labels, consistent, depths, remnants
 

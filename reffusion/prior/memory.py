@@ -113,7 +113,7 @@ def fit_to_memory(
     if backward is None:
         return replace(prior, rows=rows)
     sample_bytes = peak_bytes(lambda: backward(prior), prior.device)
-    for network in (prior.unet, prior.vae, prior.text_encoder):
+    for network in (prior.unet, prior.vae, prior.text_encoder, prior.text_encoder_2):
         if network is not None:
             network.zero_grad(set_to_none=True)
     return replace(prior, rows=rows, rows_with_grad=rows_within(budget_gb, prior.bytes, sample_bytes, param))
