@@ -64,8 +64,8 @@ def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera], exten
 
     Returns:
         The completed scenes, in the order of `scenes`: first the supported Gaussians in their order, then the extension
-        and the backdrop. The scenes are returned unchanged if there are no cameras, or if the first scene shows nothing
-        in them.
+        and the backdrop. The scenes are returned as they are if there are no cameras, or if the first scene shows
+        nothing in them.
     """
     if not cameras:
         return list(scenes)
@@ -101,7 +101,7 @@ def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Se
 
 @torch.no_grad()
 def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """Render the views, and return their blocks of `BLOCK` x `BLOCK` pixels as patches.
+    """Render the views, at least one, and return their blocks of `BLOCK` x `BLOCK` pixels as patches.
 
     The color of a patch is the block's mean color, divided by its mean alpha. Blocks with a mean alpha up to 0.5 are
     left out.
@@ -114,7 +114,7 @@ def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Pa
     """Return the Gaussians whose centers project into the image of no view as patches, seen from the cameras' middle.
 
     These Gaussians come from the scene's sparse points, whose colors are those of photographs that are not among the
-    training views. They look like blobs when rendered, because no training view supervised them, but their colors are
+    training views. Renderings of them look like blobs, because no training view supervised them, but their colors are
     correct. Unsupported Gaussians that project into a view are left out: they lie behind or inside a surface, and their
     colors are arbitrary.
 
@@ -133,12 +133,12 @@ def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Pa
 
 
 def concatenate(patches: Sequence[Patches]) -> Patches:
-    """Concatenate several sets of patches."""
+    """Concatenate sets of patches, at least one."""
     return Patches(*(np.concatenate(column) for column in zip(*patches, strict=True)))
 
 
 def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
-    """Return the `BLOCK` px blocks of a view with a mean alpha above 0.5; `color` is rendered over black."""
+    """Return the `BLOCK` px blocks of a view with a mean alpha above 0.5 as patches; `color` is rendered over black."""
     rows, columns = (np.arange(0, size, BLOCK) for size in color.shape[:2])
     total = lambda values: np.add.reduceat(np.add.reduceat(values, rows, 0), columns, 1)
     covered, size = total(alpha), total(np.ones_like(alpha))
@@ -185,7 +185,7 @@ def _fibonacci_sphere(count: int) -> np.ndarray:
 
 
 def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the points [S, 3] where rays that start inside the unit sphere leave it."""
+    """Return the points [S, 3] where rays from inside the unit sphere leave the sphere; directions have any length."""
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     # for a direction of length 0 the result is the ray's origin
     directions = directions / np.maximum(length, np.finfo(np.float64).tiny)

@@ -64,7 +64,7 @@ def find_planes(
 
     Returns:
         Up to `MAX_PLANES` planes in the order in which RANSAC found them, about by decreasing number of samples; then
-        the third faces. None are returned if there are too few samples.
+        the third faces. The list is empty if there are too few samples.
     """
     samples = sample_surfaces(center, REACH * radius, views, seed)
     points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
@@ -107,7 +107,7 @@ def find_planes(
 def _is_duplicate(
     normal: np.ndarray, offset: float, planes: Sequence[tuple[np.ndarray, float]], center: np.ndarray, distance: float
 ) -> bool:
-    """Return whether the plane normal . x = offset coincides with one of `planes` near `center`."""
+    """Return whether the plane normal . x = offset is parallel to one of `planes`, within `distance` near `center`."""
     for other, other_offset in planes:
         foot = center - (center @ other - other_offset) * other
         # Without refinement by sparse points, the position is only as precise as the views, hence the tolerance.
@@ -212,7 +212,7 @@ def _map_plane(
 
 
 def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
-    """Return the patches of fewer than `min_cells` free cells, except those at the border of the map."""
+    """Return bool [CELLS, CELLS], the patches of fewer than `min_cells` free cells; none at the map's border."""
     # Depth errors beside the object's edge make small patches. A patch at the map's border may continue beyond the map.
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # joins all patches at the map's border
     areas = np.bincount(patches.ravel(), minlength=count + 1)
@@ -231,7 +231,7 @@ def _cell_visibility(
 
 
 def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the large patches of free cells that seen cells enclose, but none at the border of the map."""
+    """Return bool [CELLS, CELLS], the large patches of free cells that seen cells enclose; none at the map's border."""
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
     found = np.zeros(patches.shape, bool)
     padded = np.pad(seen, 1)
@@ -277,7 +277,7 @@ def _continue_plane(
 def _cells_facing(
     planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[DepthView]
 ) -> list[np.ndarray]:
-    """Return per plane the cells where most views show a normal closer to the plane's than to its grounds' normals."""
+    """Return per plane the cells where most views' normals fit it better than its grounds; all without grounds."""
     # The normals of a view take more memory than all its other data, so only those of one view exist at a time.
     cells = [plane.cell_centers.reshape(-1, 3) for plane in planes]
     agreeing, visible = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))

@@ -67,7 +67,7 @@ class Mirror:
     def reflect_camera(self, camera: Camera) -> Camera:
         """Return the mirror image of a camera.
 
-        It sees the thing as the given camera sees the mirror image of the thing, with left and right swapped.
+        The mirrored camera sees the thing as the given one sees the thing's mirror image, with left and right swapped.
         """
         swap, turn = np.diag([-1.0, 1.0, 1.0, 1.0]), np.eye(4)
         turn[:3, :3] -= 2 * np.outer(self.normal, self.normal)
@@ -113,7 +113,8 @@ def render_mirrors(
 ) -> MirrorImage:
     """Render all mirror images into one view: each pixel shows the nearest plausible image, else the nearest image.
 
-    The arguments are those of `Mirror.render`. A mirror image is plausible where `plausible_depth` is finite.
+    The arguments are those of `Mirror.render`. A mirror image is plausible where `plausible_depth` is finite. Without
+    mirrors, the depth is inf everywhere.
     """
     nowhere = np.full(pixels.shape, np.inf)
     found = MirrorImage(nowhere, nowhere, np.zeros_like(pixels), np.zeros((*pixels.shape, 3), np.uint8))
@@ -132,6 +133,6 @@ def render_mirrors(
 
 
 def _fill_pits(depth: np.ndarray, fraction: float) -> np.ndarray:
-    """Fill pits of a depth map, of a radius up to `fraction` of its width; unknown pixels (0) count as the farthest."""
+    """Return a depth map without pits of a radius up to `fraction` of its width; unknown pixels (0) get its maximum."""
     radius = morphology.to_pixels(fraction, depth.shape[1])
     return cv2.morphologyEx(np.where(depth > 0, depth, depth.max()), cv2.MORPH_OPEN, morphology.disk(radius))

@@ -156,7 +156,7 @@ def robust_extent(means: Tensor) -> tuple[np.ndarray, float]:
 def surfaces_to_arrays(background: Background) -> dict[str, np.ndarray]:
     """Return planes, mirrors, center and radius as named arrays, for a file that `surfaces_from_arrays` reads.
 
-    They are stored because finding them takes seconds.
+    The surfaces are stored because finding them takes seconds.
     """
     arrays: dict[str, Any] = {"center": background.center, "radius": np.float64(background.radius)}
     for name in _PLANE_ARRAYS if background.planes else ():

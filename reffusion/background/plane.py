@@ -87,7 +87,7 @@ class Plane:
     def cell_index(self, points: np.ndarray) -> np.ndarray:
         """Return int64 [P, 2], row and column of the cells into which world points [P, 3] project orthogonally.
 
-        They may lie outside the map.
+        The cells may lie outside the map.
         """
         return np.floor((points - self.origin) @ self.axes.T / self.cell_size + CELLS / 2).astype(np.int64)
 

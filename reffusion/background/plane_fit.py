@@ -71,7 +71,7 @@ def search_planes(
 def _ransac_plane(
     points: np.ndarray, inlier_distance: float, generator: np.random.Generator
 ) -> tuple[np.ndarray, float, int]:
-    """Return normal [3] and offset of the plane with most inliers, and their number; 0 if all triples are collinear."""
+    """Return the normal [3] and offset of the plane with most inliers, and their number; 0 if there is no plane."""
     first, second, third = (points[generator.integers(len(points), size=TRIALS)] for _ in range(3))
     normals = np.cross(second - first, third - first)
     length = np.linalg.norm(normals, axis=1)

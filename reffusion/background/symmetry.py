@@ -35,7 +35,7 @@ MIN_CELLS = 200  # least number of cells of a thing
 CUT_SHARE = 0.02  # a thing with this share of its cells at the border of the search region may continue beyond it
 TEST_CELLS = 400  # approximate number of cells of a thing with which a mirror is tested
 ANGLES, OFFSETS = 24, 17  # number of angles and of offsets in the grid of mirrors that are tried
-REFINED = 12  # number of mirrors of the grid, the best ones, that are refined by minimisation
+REFINED = 12  # number of mirrors of the grid, the best ones, that are refined by minimization
 NEAR = 1.5  # in cells: a mirror image within this distance of a cell of the thing lies on the thing
 MIN_AGREEMENT = 0.93  # of the images that lie on the thing or in free space, least share that lie on the thing
 MIN_OVERLAP = 0.3  # least share of a thing's cells whose mirror images lie on the thing, away from the mirror
@@ -89,7 +89,7 @@ def find_mirrors(
 
 
 def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gaussians:
-    """Replace the harmonics of each Gaussian by its mean color in the views that show it (degree 0)."""
+    """Return the Gaussians with harmonics of degree 0: the mean colors in the views that show them, else as it was."""
     means = gaussians.means.double().cpu().numpy()
     total, count = torch.zeros_like(gaussians.means), torch.zeros_like(gaussians.means[:, :1])
     # A mirror image shows a Gaussian from directions without a photograph, where its harmonics are arbitrary.
@@ -104,7 +104,7 @@ def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gauss
 def _find_things(
     center: np.ndarray, radius: float, up: np.ndarray, views: Sequence[DepthView], planes: Sequence[Plane]
 ) -> list[np.ndarray]:
-    """Return, for each connected group of cells that several views show, the mean surface point of each cell [P, 3]."""
+    """Return the things beside the object: for each connected group of cells, their mean surface points [P, 3]."""
     cell, points = CELL * radius, _standing_points(center, radius, up, views, planes)
     if not len(points):
         return []
@@ -158,7 +158,7 @@ def _distance_from_axis(points: np.ndarray, center: np.ndarray, up: np.ndarray) 
 def _select_mirrors(
     points: np.ndarray, up: np.ndarray, cell: float, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the accepted mirrors (normal, offset) of a thing, first the one that shows most unobserved cells."""
+    """Return up to `MAX_MIRRORS` mirrors (normal, offset) of a thing; the first shows most unobserved cells."""
     candidates, found, known = _search_mirrors(points, up, cell, views), [], points
     if candidates:
         candidates = _with_matching_colors(points, candidates, cell, _mean_colors(points, views, photos))

@@ -72,11 +72,11 @@ def find_unobserved(
 ) -> HoleGeometry:
     """Split the pixels of C, the mask of the object in a view, into observed and unobserved pixels.
 
-    Each pixel of C is unprojected to a point of the background. A view shows
-    the point if it sees the point outside its mask, at the same depth and from the same side. The pixel is observed if
-    at least a quarter of the views that could see the point show it (`Visibility.is_observed`), and if no plane or
-    mirror image continues in front of the point. The quarter excludes Gaussians that most views place below a surface;
-    these are fitting artifacts. Pixels where the remaining Gaussians are not opaque are unobserved.
+    Each pixel of C is unprojected to a point of the background. A view shows the point if it sees the point outside its
+    mask, at the same depth and from the same side. The pixel is observed if at least a quarter of the views that could
+    see the point show the point (`Visibility.is_observed`), and if no plane or mirror image continues in front of the
+    point. The quarter excludes Gaussians that most views place below a surface, which are fitting artifacts. Pixels
+    where the remaining Gaussians are not opaque are unobserved.
 
     Args:
         rendering: the remaining Gaussians, rendered in the view.
@@ -122,7 +122,7 @@ def find_unobserved(
 
 
 def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return which of `pixels` have a depth behind a plane, because they show a reflection or an artifact."""
+    """Return bool [H, W], which of `pixels` have a depth behind a plane: they show a reflection or an artifact."""
     found = np.zeros_like(pixels)
     for plane in planes:
         at = plane.depth(camera)

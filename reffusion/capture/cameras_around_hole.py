@@ -76,22 +76,22 @@ class ViewQuality:
 def place_cameras(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, deleted: np.ndarray, width: int) -> Poses:
     """Place cameras around the hole, at positions where nothing hides the hole and the scene fills the picture.
 
-    From such positions the scene was probably photographed, or can at least be looked at. If fewer than three are
-    found, looser `REQUIREMENTS` are tried. No camera is inside a surface. All cameras look at the middle of the hole.
+    From such positions the scene was probably photographed, or can at least be looked at. If fewer than three positions
+    are found, looser `REQUIREMENTS` are tried. No camera is inside a surface. All look at the middle of the hole.
 
     Args:
         means: [N, 3], means of all splats of the scene before deletion, in the scene's own frame.
         sizes: [N], the median of each splat's three standard deviations. The median does not count the length of a
             needle (a long, thin splat), because no photograph shows needles.
         opaque: bool [N], True for opaque splats.
-        deleted: bool [N], True for the splats that were deleted.
+        deleted: bool [N], True for the splats that were deleted, at least one.
         width: width of the views in pixels; their height is 3/4 of it.
 
     Returns:
-        3 to `MOST` cameras without points, called around_00, around_01 and so on.
+        3 to `MOST` cameras in the frame of `means`, without points, called around_00, around_01 and so on.
 
     Raises:
-        BadInput: fewer than three positions are found, or hardly any splats remain.
+        BadInput: fewer than three positions are found, or fewer than `BESIDE` opaque splats remain.
     """
     hole, keep = means[deleted], opaque & ~deleted
     if np.count_nonzero(keep) < BESIDE:
@@ -146,7 +146,7 @@ def _estimate_up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.
 def _rate_view(
     pose: np.ndarray, away: float, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float
 ) -> ViewQuality:
-    """Return the share of the hole that a camera sees (`free`), and the share of its picture that the scene fills."""
+    """Return the `ViewQuality` of a camera that looks at the middle of the hole from the distance `away`."""
     place = -pose[:3, :3].T @ pose[:3, 3]
     # `stays`: a tree of the remaining opaque splats' means, and the radii within which rays hit them. `aim`: points in
     # the hole, whose middle is `away` from the camera. Both shares are 0 if the camera is in a splat or right in front
@@ -175,7 +175,7 @@ def _rate_view(
 
 
 def _hits(place: np.ndarray, rays: np.ndarray, ends: np.ndarray, stays: tuple[cKDTree, np.ndarray]) -> np.ndarray:
-    """Return which rays hit a splat within their lengths `ends`; `stays`: a tree of their means, and their radii."""
+    """Return bool [R], which rays from `place` hit a splat before `ends`; `stays`: tree of the splats' means, radii."""
     tree, near = stays
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     hit, traveled, on = np.zeros(len(rays), bool), np.zeros(len(rays)), np.arange(len(rays))

@@ -75,7 +75,7 @@ def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray
 def undistort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Map pixels [K, 2] of a photograph to pixels [K, 2] of its undistorted picture.
 
-    The results may lie outside the undistorted picture. They are NaN where the distortion cannot be inverted.
+    The results may lie outside the undistorted picture, and are NaN where the distortion cannot be inverted.
 
     Args:
         lens: lens of the photograph, at the size of the undistorted picture.
@@ -117,14 +117,14 @@ def distort_mask(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndar
 
 @lru_cache(maxsize=4)
 def _undistortion(lens: Lens) -> tuple[Lens, np.ndarray | None]:
-    """Return the pinhole that replaces a lens, and the `_distortion_map`, or None if it would move nothing."""
+    """Return the pinhole that replaces a lens, and the `_distortion_map`, None if distortion is negligible."""
     # cached: most captures have a single lens, and inverting it takes most of the time
     pinhole, where = undistortion_map(lens)
     return pinhole, None if where is None else _distortion_map(lens, pinhole)
 
 
 def _distortion_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """Return undistorted coordinates, float32 [H, W, 2], as OpenCV's: (0, 0) is the center of the first pixel."""
+    """Return float32 [H, W, 2], where each pixel lies undistorted; (0, 0) is the center of the first pixel."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     directions = to_directions(np.stack([columns, rows], -1), lens)
     return (directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy) - 0.5).astype(np.float32)

@@ -26,7 +26,7 @@ LARGEST = 1600  # px, larger side of the views, as of the pictures in the paper
 
 
 def perspective_camera(direction: tuple[float, float], size: int, name: str = "") -> Camera:
-    """Return the square camera of `size` px at the origin that looks in a direction; the panorama looks along z."""
+    """Return the square camera of `size` px at the origin that looks in a direction, in degrees; (0, 0) is along z."""
     heading, elevation = np.radians(direction)
     turn, tilt = np.eye(4), np.eye(4)
     turn[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(heading), -np.sin(heading), np.sin(heading), np.cos(heading)
@@ -62,17 +62,19 @@ def cut_view(panorama: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def cut_panoramas(panoramas: Mapping[str, Path], out: Path) -> str:
-    """Cut panoramas into views, images/<direction>/<name>.jpg in `out`, and place them: sparse/0, a COLMAP model.
+    """Cut panoramas into views, images/<heading>/<name>.png in `out`, and place the views: sparse/0, a COLMAP model.
+
+    The first panorama sets the size of all views (`view_size`).
 
     Args:
         panoramas: name -> file.
-        out: the folder to write, which `load_capture` reads.
+        out: the folder to write, which `load_capture` reads; it may exist if it is empty.
 
     Returns:
         A sentence about what was written.
 
     Raises:
-        BadInput: a picture is not twice as wide as high; `out` is not empty; or too few panoramas can be placed.
+        BadInput: a picture is not twice as wide as high; `out` is not empty; or fewer than 3 panoramas can be placed.
     """
     if out.exists() and any(out.iterdir()):
         raise BadInput(f"{out}: not empty; name another folder (--out)")
@@ -93,5 +95,5 @@ def cut_panoramas(panoramas: Mapping[str, Path], out: Path) -> str:
 
 
 def _folder(direction: Sequence[float]) -> str:
-    """Return the name of a direction's folder."""
+    """Return the name of a direction's folder: its heading in three digits, such as "045"."""
     return f"{round(direction[0]):03d}"

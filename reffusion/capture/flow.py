@@ -30,7 +30,7 @@ LEAST_CONTRAST = 0.7  # levels of 255: standard deviation in a window of 9 px, b
 # px: assumed standard deviation of flow. A point is dropped if its inverse depth is negative by more than two of the
 # standard deviations that follow from it, so that it would lie behind the camera.
 NOISE = 0.3
-FARTHEST = 20.0  # units of the normalised frame: points farther away, as in the sky, are moved to this depth
+FARTHEST = 20.0  # units of the normalized frame: points farther away, as in the sky, are moved to this depth
 ZOOM = 1.1  # ratio of focal lengths from which a neighbor's picture is resampled to this view's focal length
 
 
@@ -63,7 +63,7 @@ def triangulate_points(
     with a depth above `FARTHEST` are moved to this depth.
 
     Args:
-        cameras: cameras of undistorted views in the normalised frame. Fewer than two give no points.
+        cameras: cameras of undistorted views in the normalized frame. Fewer than two give no points.
         images: view name -> uint8 [H, W, 3].
         cell: side of a cell in pixels, at least 1.
 
@@ -93,6 +93,7 @@ def match_views(
     """Yield the matches of each of the `chosen` views with its neighbors among `cameras`, one pixel per cell.
 
     Args:
+        chosen: some of the `cameras`. A view without neighbors has matches with K = 0.
         images: view name -> uint8 [H, W, 3], for all `cameras`.
         cell: side of a cell in pixels.
     """
@@ -117,9 +118,9 @@ def match_views(
 
 
 def find_neighbors(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras at other places whose axes are within 40 degrees (`TURN`) of that of `camera`.
+    """Return the nearest cameras at other places whose axes are within 40 degrees (`TURN`) of that of `camera`.
 
-    These are the nearest ones, at most `NEIGHBORS`, sorted by distance.
+    The list holds at most `NEIGHBORS` cameras, the nearest first.
     """
     away = {other.name: float(np.linalg.norm(other.center - camera.center)) for other in cameras}
     axis = camera.world_to_camera[2, :3]
@@ -207,8 +208,8 @@ def depths_from_matches(matches: Matches, cameras: Mapping[str, Camera]) -> tupl
         cameras: view name -> camera, of the view and its neighbors.
 
     Returns:
-        Depth [P], very large if there is no parallax; and bool [P], True if the depth is reliable. It is reliable if
-        at least two neighbors agree (one, if there is only one), and if the point is not clearly behind the camera.
+        Depth [P], very large if there is no parallax; and bool [P], True if the depth is reliable: at
+        least two neighbors agree (one, if there is only one), and the point is not clearly behind the camera.
     """
     count = len(matches.pixels)
     if not matches.others:
@@ -233,7 +234,7 @@ def flow_residuals(matches: Matches, cameras: Mapping[str, Camera], depth: np.nd
     """Return the residual vectors [K, P, 2] in pixels of a view's points in its K neighbors.
 
     A vector leads from the pixel that flow found in the neighbor to the projection of the point there, also where the
-    match is not valid (`Matches.seen`). It is NaN if the point is behind the neighbor.
+    match is not valid (`Matches.seen`). The vector is NaN if the point is behind the neighbor.
 
     Args:
         depth: [P], depths of the pixels of `matches`; the points lie there on their rays.
@@ -310,7 +311,7 @@ def locate_cells(camera: Camera, points: np.ndarray, cell: int) -> tuple[np.ndar
         cell: side of a cell in pixels. The last cells may reach beyond the picture.
 
     Returns:
-        Indices [P], and depths [P], camera z.
+        Indices int [P], and depths [P], camera z, which are not positive behind the camera.
     """
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     cells, front = np.full(len(local), -1), np.flatnonzero(local[:, 2] > 1e-3)

@@ -27,7 +27,7 @@ def is_enlarged(images: Iterable[np.ndarray], detail: float) -> bool:
     0.01 to 0.08.
 
     Args:
-        images: uint8 [H, W, 3], at the size at which they would be used; some of the views are enough.
+        images: uint8 [H, W, 3] each, at the size at which they would be used; some of the views are enough.
         detail: threshold for the median ratio of the pictures; below it the result is True.
     """
     return float(np.median([_octave_ratio(image) for image in images])) < detail

@@ -61,7 +61,7 @@ class Lens:
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def coefficients(self) -> str:
-        """Return the model and its coefficients that are not 0, for messages: `SIMPLE_RADIAL k1=0.0124`."""
+        """Return the model and the coefficients other than 0, for messages: `SIMPLE_RADIAL k1=0.0124`."""
         names = [(f"k{i}", k) for i, k in enumerate(self.radial, start=1)]
         names += [(f"k{i}", k) for i, k in enumerate(self.denominator, start=4)]
         names += [("p1", self.tangential[0]), ("p2", self.tangential[1])]
@@ -238,8 +238,8 @@ def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
 def undistortion_map(lens: Lens) -> tuple[Lens, np.ndarray | None]:
     """Return how to undistort pictures of a lens: the pinhole that replaces the lens, and the `sampling_map`.
 
-    The map is None if the distortion is so small that pictures need no resampling. Raises BadInput as
-    `undistorted_pinhole` does.
+    The map is None if the distortion is so small that pictures need no resampling. The map is cached and must not be
+    changed. Raises BadInput as `undistorted_pinhole` does.
     """
     pinhole = undistorted_pinhole(lens)
     return pinhole, None if pinhole == lens.pinhole else sampling_map(lens, pinhole)

@@ -96,7 +96,7 @@ def _read(
 
 
 def _restrict_to_poses(capture: Capture, correction: Correction) -> Capture:
-    """Return a capture without the views whose pose the correction loses, and with EXIF tags obeyed where poses do."""
+    """Return the capture without the views that lack a pose, and with `upright` set as the poses or correction need."""
     if capture.poses is None:
         return capture
     lenses = capture.poses.lenses

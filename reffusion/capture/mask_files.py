@@ -51,14 +51,14 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
 
     If no folder is named, masks are taken from the first of these places that has some: `label` in the folder of
     pictures, the usual folders, masks beside their pictures (`A_mask.png` or `A.json` beside `A.png`), the files that
-    the layout names (`Capture.ignore_masks`), whose black pixels then mark the object. Masks of left-out pictures are
-    dropped.
+    the layout names (`Capture.ignore_masks`). Black pixels of the latter mark the object. Masks of left-out pictures
+    are dropped.
 
     Args:
         spec: the key `masks` of scene.yaml (`reffusion.params.capture`): a folder or a COCO file, optionally with the
             numbers that mark the object; "none" for no masks; None to search.
-        optional: True if it is no error that the search finds no masks. A folder that `spec` names must hold masks in
-            any case.
+        optional: True to return no masks if the search finds none, False to raise BadInput. A folder that `spec` names
+            must hold masks in any case.
 
     Raises:
         BadInput: there are no masks, or as for `group_by_object`; the message names the file or folder and the remedy.
@@ -99,14 +99,17 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
 
 
 def find_ignore_masks(folder: Path, capture: Capture, name: str | None) -> dict[str, tuple[Path, ...]]:
-    """Return view -> files of the masks of what is ignored in it: one named like its picture, one for all views.
+    """Return view -> files of its ignore masks: those for all views (`ALL_VIEWS`), then one named like its picture.
+
+    Views without a mask have no entry.
 
     Args:
         folder: the scene's folder.
         name: the key `ignore` of scene.yaml: the folder of the masks; "none" for none; None for the usual folder.
 
     Raises:
-        BadInput: a folder that is named holds no masks, a mask belongs to no picture, or two belong to one.
+        BadInput: the folder is named or exists, but holds no masks; a mask belongs to no picture; or two masks belong
+            to one picture.
     """
     if name is not None and name.lower() == NONE:
         return {}
@@ -131,7 +134,7 @@ def _pictures_folder(capture: Capture) -> Path | None:
 
 
 def _mask_paths(place: Path, capture: Capture) -> tuple[Path, list[str]]:
-    """Return the folder or COCO file of the masks, and their relative paths; raises BadInput for two COCO files."""
+    """Return the folder or COCO file of the masks, and their paths in it, perhaps none; BadInput for two COCO files."""
     if place.suffix.lower() == ".json" and place.is_file():
         return place, annotated_pictures(place)
     found = _visible_files(place, (*ENDINGS, *MASK_ENDINGS))
@@ -162,7 +165,7 @@ def _visible_files(place: Path, endings: Collection[str] = ()) -> list[str]:
 
 
 def _unread(place: Path) -> str:
-    """Return which files of a folder without masks are not read, as the end of a sentence; empty if it has none."""
+    """Return what a folder without masks holds instead, as the end of a sentence; "" if it holds nothing."""
     counts = Counter(Path(path).suffix or "without ending" for path in _visible_files(place))
     found = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
     return f"; {place.name} holds {found}, not read as masks" if found else ""
@@ -208,7 +211,7 @@ def _are_picture_folders(folders: Collection[str], capture: Capture) -> bool:
 
 
 def match_masks(place: Path, files: Collection[str], capture: Capture, strict: bool = True) -> dict[str, str]:
-    """Return mask -> the view to which it belongs, or the path of a left-out picture to which it belongs.
+    """Return mask -> the view, or the path of the left-out picture, to which the mask belongs.
 
     Several masks may belong to one view.
 

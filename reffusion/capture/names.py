@@ -185,10 +185,10 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
 
 
 def mask_stems(mask: str) -> list[str]:
-    """Return the paths, without ending, that the picture of the mask at a path may have; the likeliest comes last.
+    """Return two or three paths, without ending, that the picture of a mask may have; the likeliest comes last.
 
-    They are the mask's path without its ending, without a second ending (`A.jpg` -> `A`), and without a suffix or
-    prefix of masks (`A_mask` -> `A`).
+    The first is the path `mask` without its ending. The second lacks a second ending, too (`A.jpg` -> `A`). The third,
+    if the name has a suffix or prefix of masks, lacks this as well (`A_mask` -> `A`).
     """
     path = normalize_path(mask)
     stem, _, ending = path.rpartition(".")

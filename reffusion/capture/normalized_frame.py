@@ -1,4 +1,4 @@
-"""The normalised frame of a scene: the similarity into this frame, which follows from estimates of the scene's depth.
+"""The normalized frame of a scene: the similarity into this frame, which follows from estimates of the scene's depth.
 
 For scenes with few sparse points, random points are added.
 """
@@ -112,13 +112,13 @@ def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def normalizing_similarity(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
-    """Return the similarity into the normalised frame.
+    """Return the similarity into the normalized frame.
 
     In this frame the middle of the scene is at the origin, and the typical distance of the cameras from it is 1. The
     scale is one over the median of the typical depths. The offset is the median, axis by axis, of the points at typical
     depth on the optical axes. So for photographs from one side the object is near the origin, and the cameras are at a
     distance of about 1. For photographs from all around, the cameras lie on a ring of radius about 1. A scaled or
-    translated scene has the same normalised frame. There is no rotation. All numbers are float64, so coordinates that
+    translated scene has the same normalized frame. There is no rotation. All numbers are float64, so coordinates that
     are offset by a million times the scene's extent (geo-referenced ones) keep ten digits.
 
     Args:
@@ -132,7 +132,7 @@ def normalizing_similarity(world_to_camera: np.ndarray, typical: np.ndarray) -> 
 
 
 def normalize_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """Convert a world-to-camera pose [4, 4] of the scene's own frame to one of the normalised frame."""
+    """Convert a world-to-camera pose [4, 4] of the scene's own frame to one of the normalized frame."""
     pose = world_to_camera.copy()
     pose[:3, 3] = similarity.scale * (world_to_camera[:3, :3] @ similarity.offset + world_to_camera[:3, 3])
     return pose
@@ -151,7 +151,9 @@ def _stack_poses(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
 def normalize_scene(
     poses: Poses, pinholes: Mapping[str, Lens], train: Sequence[str], test: Sequence[str], clean: frozenset[str]
 ) -> Scene:
-    """Return a capture's cameras and sparse points as a Scene in the normalised frame (`normalizing_similarity`).
+    """Return a capture's cameras and sparse points as a Scene in the normalized frame (`normalizing_similarity`).
+
+    Raises BadInput as `depth_ranges` does.
 
     Args:
         poses: poses and points in the scene's own frame.
@@ -185,7 +187,7 @@ def add_random_points(
     Each point has the color of the pixel for which it was drawn.
 
     Args:
-        ranges: [V, 3] near, typical and far depth of each view in `scene.cameras`, in the normalised frame.
+        ranges: [V, 3] near, typical and far depth of the views of `scene.cameras` in order, in the normalized frame.
         image_of: function from a view's name to its picture, uint8 [H, W, 3].
     """
     names = list(scene.cameras)
@@ -208,7 +210,7 @@ def sample_frustum_points(
     points float in front of a single camera.
 
     Args:
-        ranges: [V, 3] near, typical and far depth of each of the V cameras.
+        ranges: [V, 3] near, typical and far depth of each of the V cameras, V > 0.
 
     Returns:
         points [count, 3]; int [count], the index of the view for which each point was drawn; int [count, 2], the

@@ -23,12 +23,13 @@ class Edit:
     """What a user did to the N Gaussians of a scene in an editor.
 
     Attributes:
-        deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names, but for
-            those that were cropped.
-        scattered: bool [N], True for deleted Gaussians that leave no hole to fill: they stood alone, or were filtered.
+        deleted: bool [N], True for Gaussians that are missing in the cleaned file (named by the parameter `cleaned`),
+            except the cropped ones.
+        scattered: bool [N], True for deleted Gaussians that leave no hole to fill: they stood alone among Gaussians
+            that stay, or were filtered by opacity.
         cropped: bool [N], True for Gaussians that were deleted around what stays.
-        movement: takes the scene to the place that it has in the file.
-        added: Gaussians that only the file has, in the scene's own frame; None without any.
+        movement: takes the scene to the place that it has in the cleaned file.
+        added: Gaussians that only the cleaned file has, in the scene's own frame; None without any.
     """
 
     deleted: np.ndarray
@@ -56,7 +57,7 @@ class OwnSplats:
 
 
 def load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
-    """Load the Gaussians that a scene brings, and find what was done to them; return None without any.
+    """Load the Gaussians that a scene brings, and find and print what was done to them; return None without any.
 
     Raises:
         BadInput: a file is unusable, or what was done leaves no hole.
@@ -75,13 +76,13 @@ def load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
 
 
 def _describe_looks(rows: Rows) -> Cloud:
-    """Return what is known of Gaussians to recognize them."""
+    """Return the means, sizes, colors and opacities by which Gaussians are recognized."""
     opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))
     return Cloud(rows.means, rows.log_scales, 0.5 + SH0 * rows.sh[:, 0], opacities)
 
 
 def _find_edit(files: tuple[Path, Path], whole: Rows, cleaned: Rows) -> Edit:
-    """Find what was done to the Gaussians of the whole scene; raises BadInput if it is unclear or leaves no hole."""
+    """Find and print what was done to the Gaussians `whole`; raises BadInput if it is unclear or leaves no hole."""
     cloud = _describe_looks(whole)
     match = matching.match_gaussians(cloud, _describe_looks(cleaned))
     if match.movement is None:

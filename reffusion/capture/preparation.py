@@ -40,8 +40,10 @@ Load = Callable[[Iterable[str]], dict[str, np.ndarray]]
 def read_capture(params: Params, scene: Path) -> tuple[Capture, Roles, list[str]]:
     """Read a scene folder, and correct poses that the photographs contradict unless `params.trust`.
 
+    The result of the comparison is printed.
+
     Returns:
-        The capture, the roles of its views, and a sentence on the correction if there is one.
+        The capture, the roles of its views, and a list with a sentence on the correction, empty without a correction.
 
     Raises:
         BadInput: as for `read_scene`, or no correction makes poses and photographs agree.
@@ -58,7 +60,11 @@ def read_capture(params: Params, scene: Path) -> tuple[Capture, Roles, list[str]
 
 
 def choose_size(params: Params, capture: Capture, roles: Roles) -> int:
-    """Return the larger image side, px, at which to use the pictures: `params.longest`, or half if that is as sharp."""
+    """Return the larger image side, px, at which to use the pictures: `params.longest`, or half of their own side.
+
+    Half of the side is taken, and this printed, if the pictures show no more detail than at that size. The detail is
+    not tested if `params.min_detail` is 0.
+    """
     if params.min_detail == 0:
         return params.longest
     # Up to 15 training views are tested. Pictures that are blurred or were enlarged are halved.
@@ -75,6 +81,9 @@ def adjust_views(
     params: Params, roles: Roles, scene: Scene, load: Load
 ) -> tuple[Scene, list[str], dict[str, float | None] | None]:
     """Leave out views that contradict their poses, and adjust the cameras of the others to optical flow.
+
+    Cameras are adjusted only if `params.refine`, and if the scene brings no Gaussians. A scene with fewer than
+    `LEAST_POINTS` points gets points from optical flow. The residuals are printed.
 
     Returns:
         The scene; sentences about views that are left out or doubtful; and the residuals of the cameras, px, "before"
@@ -99,10 +108,10 @@ def adjust_views(
 
 
 def complete_points(scene: Scene, poses: Poses, pinholes: Mapping[str, Lens], load: Load) -> Scene:
-    """Add random points to a scene with fewer than `LEAST_POINTS`, within the depths that its views see.
+    """Add `MORE_POINTS` random points to a scene with fewer than `LEAST_POINTS`, within the depths that its views see.
 
     Args:
-        scene: the scene in the normalised frame.
+        scene: the scene in the normalized frame.
         poses: the poses of the capture.
         pinholes: view -> its undistorted camera, of all views of the scene.
         load: reads undistorted pictures.
@@ -125,7 +134,10 @@ def place_gaussians_only(
     The cameras are those of the folder. Without any, some are placed around the hole.
 
     Returns:
-        The scene in the normalised frame, its undistorted cameras in its own frame, and sentences for the user.
+        The scene in the normalized frame; view name -> the pinhole of its undistorted picture; sentences for the user.
+
+    Raises:
+        BadInput: the cameras of the folder cannot be read, or no place for cameras is found (`place_cameras`).
     """
     rows, found = own_splats.splats.rows, cameras.read(folder)
     assert own_splats.edit is not None
@@ -150,7 +162,7 @@ def place_gaussians_only(
 
 
 def _adjust_cameras(params: Params, scene: Scene, load: Load) -> tuple[Scene, dict[str, float | None] | None]:
-    """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points."""
+    """Adjust cameras to optical flow if `params.refine`, add points from flow if there are few; as `adjust_views`."""
     residuals = None
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         scene, residuals = _refine_cameras(scene, load)
@@ -173,7 +185,7 @@ def _refine_cameras(scene: Scene, load: Load) -> tuple[Scene, dict[str, float | 
 
 
 def _add_flow_points(scene: Scene, load: Load) -> Scene:
-    """Add up to `MORE_POINTS` points, triangulated from optical flow between the training views."""
+    """Return the scene with up to `MORE_POINTS` more points, triangulated from flow between the training views."""
     views = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in views)
     # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.

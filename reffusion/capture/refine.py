@@ -1,6 +1,6 @@
 """Tests whether cameras fit their photographs, and adjusts the cameras if they do not.
 
-Poses that come with a capture were solved with one lens for all views. But a phone's stabiliser shifts the lens from
+Poses that come with a capture were solved with one lens for all views. But a phone's stabilizer shifts the lens from
 shot to shot. Then no pose fits near and distant objects at once: distant objects are off by a pixel or two, and no
 Gaussian is sharp in all views. Optical flow between neighboring views shows such errors everywhere in the picture. The
 pose and the principal point of each view are then adjusted to the flow by bundle adjustment (Ceres, through COLMAP).
@@ -24,7 +24,7 @@ from reffusion.types import Camera
 
 # px of `flow_residual` up to which cameras stay as given; exact cameras have 0.08, COLMAP's own poses 0.10
 GOOD_RESIDUAL = 0.15
-# Largest accepted ratio of the residuals after and before adjustment. If stabilisers moved principal points (`statue`),
+# Largest accepted ratio of the residuals after and before adjustment. If stabilizers moved principal points (`statue`),
 # the ratio is 0.2. If the ratio is above a half (`fox`, `bear`, `garden`, `dinosaur`: 0.7 to 0.85), the residuals come
 # from something else that moves in the pictures. The adjusted cameras then follow this motion, and held-out views get
 # worse (docs/method.md#cameras-and-fit).
@@ -37,7 +37,7 @@ PROBE_VIEWS = 8  # views for the first, quick test
 # cells of this test along a picture's longer side: cells grow with the picture, as the noise of flow does
 PROBE_CELLS = 64
 LEAST_CELL = 8  # px: smallest cell of the test
-# share of the longer side: a principal point that would move further, more than stabilisers do, is held fixed
+# share of the longer side: a principal point that would move further, more than stabilizers do, is held fixed
 LARGEST_SHIFT = 0.02
 
 
@@ -47,8 +47,8 @@ class Refinement:
 
     Attributes:
         cameras: view name -> camera, adjusted or as given.
-        before: `flow_residual` of the given cameras in pixels; NaN if no views match. It is that of the quick test if
-            the quick test decided, else that at the half of the matches which is not used for adjustment.
+        before: `flow_residual` of the given cameras in pixels; NaN if no views match. If the quick test decided, this
+            is its residual, else the residual at the half of the matches that is not used for adjustment.
         after: `flow_residual` of the adjusted cameras at the same matches; None if the cameras are as given, also if
             adjusted cameras were rejected.
     """
@@ -67,7 +67,7 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
     their residual at the former half is less than `LARGEST_RATIO` times that of the given cameras.
 
     Args:
-        cameras: cameras of undistorted views in the normalised frame.
+        cameras: cameras of undistorted views in the normalized frame.
         images: view name -> uint8 [H, W, 3].
     """
     initial = {camera.name: camera for camera in cameras}
@@ -91,7 +91,7 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
 
 
 def _adjust(matches: Sequence[flow.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Return the cameras after `ROUNDS` rounds of `bundle_adjust`."""
+    """Return the cameras after `ROUNDS` rounds of `bundle_adjust`; runaway principal points are held fixed."""
     fixed: set[str] = set()
     while True:
         cameras = dict(initial)

@@ -38,7 +38,7 @@ class Roles:
         test_masks: test view -> file of a mask of where the view shows the object, or would show it. Scores are
             computed in the bounding box of this mask.
         warnings: sentences for the user.
-        camera_only: names of the camera-only views. They are neither training nor test views.
+        camera_only: names of the camera-only views, which are neither training nor test views.
         values: the pixel values in `masks` that mark the object.
         fill: training view -> file of a mask of the pixels to fill, whatever the photograph shows there.
         ignore: view -> files of masks of pixels that neither train nor are filled, such as those of a passer-by.
@@ -112,9 +112,9 @@ def assign_roles(
     - the views that the layout itself holds out (`Capture.test`), except those that `train` names;
     - the views whose pictures are called test_*, if most are not, except those that `train` names.
 
-    Training views are the views that `train` names, else all views that are neither test nor camera-only views, without
-    those in neither list of the layout's own (`Capture.unused`). All other views are left out of the scene, unless they
-    are camera-only views.
+    Training views are the views that `train` names, else all views that are neither test nor camera-only views, except
+    those that the layout's own lists leave out (`Capture.unused`). All other views are left out of the scene, unless
+    they are camera-only views.
 
     Args:
         folder: the scene's folder.
@@ -203,7 +203,7 @@ def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> fr
 def _split_masks(
     test: list[str], masks: dict[str, Path], labels: dict[str, Path]
 ) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Return two mappings of test view -> file: the masks of the object in its photograph, and `Roles.test_masks`."""
+    """Return two mappings of test view -> file: masks of the object in the photograph, and `Roles.test_masks`."""
     # A test view with a mask, and no test mask, shows the object. Its photograph is no ground truth inside the mask,
     # which is then also its test mask.
     held_out = {name: path for name, path in masks.items() if name in set(test)}
@@ -226,7 +226,7 @@ def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path
 
 
 def capture_views(capture: Capture, roles: Roles) -> ViewTable:
-    """Return the table of all views of a capture, against which files that the user made for a view are checked."""
+    """Return the table of all views of a capture, to check files that the user made for one of them."""
     return ViewTable(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture))
 
 
@@ -241,7 +241,7 @@ def _split_views(
     camera_only: list[str],
     capture: Capture,
 ) -> tuple[list[str], list[str]]:
-    """Return the training and test views, see `assign_roles`; `labelled` are the views of the test masks."""
+    """Return the training and test views; `labelled`: views of the test masks. Raises BadInput for a view in both."""
     test_views = test if test is not None else (labelled or [*capture.test] or _views_named_test(capture))
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *camera_only, *capture.unused}]
@@ -262,7 +262,7 @@ def _views_named_test(capture: Capture) -> list[str]:
 def _camera_only_views(
     cameras_only: Sequence[str] | str | None, named: Sequence[str] | None, used: set[str], capture: Capture
 ) -> tuple[str, ...]:
-    """Return the names of the camera-only views; `named` is None if the key `cameras_only` is "others"."""
+    """Return the camera-only views: `named`, or all not `used` for None; BadInput if a list names a used view."""
     if cameras_only is None:
         return ()
     if named is None:
@@ -299,7 +299,7 @@ def _select_views(value: Sequence[str] | str | None, capture: Capture, key: str)
 
 
 def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
-    """Return the sorted test masks in a folder, None if it has none; raises BadInput if scene.yaml names it."""
+    """Return the sorted test masks in a folder; if empty, None, or raise BadInput if scene.yaml names it."""
     if test_masks is not None and test_masks.lower() == NONE:
         return None
     files = [found / path for path in list_pictures(found, nested=True)]

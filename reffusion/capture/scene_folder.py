@@ -65,7 +65,7 @@ def read_scene(
 
 
 def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
-    """Return the capture and the roles without the views in `exclude` of scene.yaml, and with `keep` in the roles."""
+    """Return capture and roles without views in `exclude` of scene.yaml, with `keep`; BadInput for a view in both."""
     excluded, kept = (
         {resolve_view(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep")
     )
@@ -117,7 +117,7 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
 
 
 def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
-    """Return whether the scene has Gaussians but no photographs. It may have cameras (a transforms file, COLMAP model).
+    """Return whether the scene has Gaussians but no photographs; cameras (a transforms file, COLMAP model) may exist.
 
     Then scene.yaml names a fitted scene of Gaussians as `gaussians`, and as `cleaned` the same scene after the user
     deleted the object. Renders of these Gaussians are used in place of photographs. Only `cleaned` is tested here;

@@ -143,7 +143,7 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
 
 
 def _match(database: Path, folder: Path, masks: Path | None, seed: int) -> None:
-    """Write SIFT features outside black of masks, and matches of all pairs; the number of threads changes nothing."""
+    """Write SIFT features, none where masks are black, and matches of all pairs to the database, reproducibly."""
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
@@ -157,7 +157,7 @@ def _match(database: Path, folder: Path, masks: Path | None, seed: int) -> None:
 
 
 def _reconstruct(database: Path, pictures: Path, work: Path, seed: int, is_rig: bool = False):
-    """Return the `pycolmap.Reconstruction` with the most views, or None without any; a rig's lenses and poses stay."""
+    """Return the `pycolmap.Reconstruction` with most views, or None; `is_rig`: lenses and poses in the rig stay."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
@@ -243,7 +243,7 @@ def relative_focal_length(photograph: Path, work: Path) -> float | None:
 
 @lru_cache(maxsize=64)  # most photographs of a capture have the same tags
 def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Path) -> float | None:
-    """Return `relative_focal_length` for EXIF (tag, value) pairs, which name the camera or tell the focal length."""
+    """Return `relative_focal_length` from EXIF (tag, value) pairs: `camera` has maker and model, `focal` the rest."""
     import pycolmap
 
     tags = Image.Exif()
@@ -264,7 +264,7 @@ def bundle_adjust(
 ) -> dict[str, Camera]:
     """Return cameras with poses and principal points adjusted by bundle adjustment. Focal lengths stay fixed.
 
-    The sum of a robust loss (soft L1) of the reprojection errors is minimised over poses, principal points and points.
+    The sum of a robust loss (soft L1) of the reprojection errors is minimized over poses, principal points and points.
 
     Args:
         cameras: view name -> camera to start from. A view with fewer than `LEAST_SIGHTINGS` observations keeps its
@@ -314,7 +314,7 @@ def bundle_adjust(
 
 
 def _camera(camera: Camera, image, lens) -> Camera:
-    """Return `camera` with the pose of a `pycolmap.Image` and the intrinsics of a PINHOLE `pycolmap.Camera`."""
+    """Return `camera` with the pose of `image`, a `pycolmap.Image`, and the intrinsics of `lens`, a PINHOLE camera."""
     pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
     pose[:3] = image.cam_from_world().matrix()
     return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)
@@ -328,8 +328,8 @@ def reconstruct_rigs(pictures: Path, cameras: Sequence[Camera], model: Path, wor
     Args:
         pictures: folder with a folder of each camera, which holds its pictures; those of one moment have one name.
         cameras: the cameras, in the rig's frame; their names are those of the folders.
-        model: folder of the COLMAP model to write.
-        work: temporary folder, which is deleted after success.
+        model: folder of the COLMAP model to write; it must not exist.
+        work: temporary folder. The folder is emptied first, and deleted after success.
 
     Returns:
         The number of moments that were placed.

@@ -37,7 +37,7 @@ def resized_lens(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]
     """Return the lens of a view's photograph and the pinhole of its undistorted picture, without writing the picture.
 
     Both are for the size that the picture has after reduction to `longest` (`fitting_size`). This is for camera-only
-    views (views whose pixels are not used).
+    views (views whose pixels are not used). Raises BadInput as `undistorted_pinhole` does.
     """
     width, height = image_size(capture.pictures[name], upright=capture.upright)
     lens = capture.poses.lenses[name].resized(*fitting_size(width, height, longest))
@@ -67,7 +67,7 @@ def save_undistorted_view(out: Path, name: str, capture: Capture, longest: int) 
 
 
 def describe_transparency(names: Collection[str], capture: Capture) -> list[str]:
-    """Return a warning that names the views with transparent pixels in their photographs; no warning without any.
+    """Return one warning that names the views with transparent pixels in their photographs, in a list, else [].
 
     Only photographs with an alpha channel are read.
     """
@@ -83,7 +83,7 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     """Write the undistorted masks of the view `name` below `out`, as far as the view has such masks.
 
     The files are masks/<view>.png (masks/<object>/<view>.png if masks distinguish between objects),
-    test_masks/<view>.png and fill/<view>.png. They have the size of `lens`.
+    test_masks/<view>.png and fill/<view>.png, all of the size of `lens`.
 
     Args:
         lens: lens of the view's photograph, with its distortion, at the size of the undistorted picture.
@@ -112,7 +112,7 @@ def load_undistorted_mask(path: Path, lens: Lens, values: MaskValues = WHITE) ->
 
 
 def save_ignored_pixels(out: Path, name: str, roles: Roles, lens: Lens) -> None:
-    """Write the pixels of the view `name` that are ignored to `out`/ignored/<view>.png, if masks mark some.
+    """Write the union of a view's ignore masks, undistorted, to `out`/ignored/<view>.png; nothing without masks.
 
     Args:
         lens: lens of the view's photograph at the size of the undistorted picture.
@@ -122,7 +122,7 @@ def save_ignored_pixels(out: Path, name: str, roles: Roles, lens: Lens) -> None:
 
 
 def check_ignored(ignore: Mapping[str, Sequence[Path]]) -> None:
-    """Check masks of what is ignored, view -> files; raises BadInput if one is unreadable or covers a whole view."""
+    """Raise BadInput if an ignore mask is unreadable, or a view's masks together cover it; `ignore`: view -> files."""
     for name, paths in ignore.items():
         if load_united_masks(paths, mask_file_size(paths[0])[::-1]).all():
             raise BadInput(

@@ -129,7 +129,7 @@ def _refuse_other_files(path: Path) -> None:
 def measure_frames(video: Path) -> list[FrameStats]:
     """Return the sharpness and distance of each frame, or of every n-th frame if there are more than `LOOKED_AT`.
 
-    Frames that cannot be decoded are left out.
+    Frames that cannot be decoded are left out. Raises BadInput if the video cannot be opened.
     """
     count = _count(video)
     every, way, seen = max(1, -(-count // LOOKED_AT)), _MotionTracker(), []
@@ -221,7 +221,7 @@ class _MotionTracker:
 
 
 def _spacing(seen: list[FrameStats]) -> float:
-    """Return the size of a window: the distance between two selected frames, in widths of the picture."""
+    """Return the size of a window, about the distance between two selected frames, in widths of the picture."""
     return seen[-1].distance / min(MOST, max(FEWEST, round(seen[-1].distance / SPACING)))
 
 
@@ -232,7 +232,7 @@ def select_frames(seen: list[FrameStats]) -> tuple[list[FrameStats], list[FrameS
     candidate is blurred if its sharpness is below `BLURRED` times the median of the candidates around it.
 
     Args:
-        seen: the measured frames, in order.
+        seen: the measured frames, in order; the distance of the last one is above 0.
 
     Returns:
         The selected frames, and the blurred candidates, which are left out.

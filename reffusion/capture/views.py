@@ -21,7 +21,7 @@ from reffusion.io.files import BadInput
 class ViewTable:
     """The names and picture sizes of a scene's views.
 
-    They are either all views of a capture (`reffusion.capture.roles.capture_views`), or only the placed views.
+    The views are either all views of a capture (`reffusion.capture.roles.capture_views`), or only the placed views.
 
     Attributes:
         names: names of all these views.
@@ -48,10 +48,10 @@ def load_placed_views(poses_dir: Path) -> ViewTable:
 
 
 def resolve_view(name: str, names: Collection[str], key: str) -> str:
-    """Return the name of the view that the user means by `name` (see `find_view`).
+    """Return the name of the view that the user means by `name`, by the rules of `find_view`.
 
     Args:
-        name: a view's name, or a path of its picture.
+        name: a view's name, or the name or path of its picture.
         names: names of the views that exist.
         key: the key of scene.yaml in which `name` is written, for the message.
 
@@ -67,7 +67,7 @@ def resolve_file_view(path: Path, name: str, views: ViewTable, key: str) -> str:
     """Return the name of the view for which the file at `path` was made.
 
     Args:
-        name: the view's name, or a path of its picture.
+        name: the view's name, or the name or path of its picture.
         key: the key of scene.yaml in which `name` is written, for the message.
 
     Raises:
@@ -117,7 +117,8 @@ def outlier_error(where: str, name: str) -> BadInput:
 def find_view(name: str, names: Collection[str]) -> str | None:
     """Return the view in `names` that a user means by a view name, a file name or a path; None if there is none.
 
-    A path may mean a view that is named by its path: `cam0/0001.png` is the view `cam0-0001`, or `0001`.
+    A path means the view that is named by the path, else the view that is named by the file: `cam0/0001.png` is the
+    view `cam0-0001`, else `0001`.
     """
     path = strip_ending(normalize_path(name))
     spellings = (name, path, flatten(path), path.rpartition("/")[2], Path(name).stem)
@@ -125,7 +126,7 @@ def find_view(name: str, names: Collection[str]) -> str | None:
 
 
 def _similar_names(name: str, names: Collection[str]) -> str:
-    """Return the three of `names` that are most similar to `name`, joined by commas."""
+    """Return up to three of `names` that are most similar to `name`, joined by commas."""
     return ", ".join(get_close_matches(name, names, 3, 0.0))
 
 

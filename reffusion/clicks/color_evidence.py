@@ -107,10 +107,10 @@ def color_votes(
 
 
 def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray | None:
-    """Return float [H, W], how much each pixel's color speaks for the object (> 0) or against it (< 0).
+    """Return float [H, W], how much each pixel's color speaks for the object (> 0) or against the object (< 0).
 
-    It is the natural logarithm of a ratio: the frequency of the color among the object's pixels, divided by that among
-    the pixels around the object.
+    This is the natural logarithm of a ratio: the frequency of the color among the object's pixels, divided by that
+    among the pixels around the object.
 
     Args:
         image: uint8 [H, W, 3].
@@ -132,5 +132,5 @@ def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) 
 
 
 def sample_evenly(names: Sequence[str], most: int) -> list[str]:
-    """Return at most `most` of the names, at equal steps."""
+    """Return at most `most` of the names, at about equal steps from the first to the last, in their order."""
     return [names[k] for k in np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int))]

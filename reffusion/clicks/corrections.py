@@ -34,7 +34,7 @@ def apply_marks(
 
     Args:
         marks: all marks of the view, in the order in which they were made.
-        before: bool [H, W], the mask after the marks before `first`; None for an empty mask.
+        before: bool [H, W], the mask after the marks before `first`, which is not changed; None for an empty mask.
         first: index of the first mark that is not yet applied in `before`.
     """
     shape = view.image.shape[:2]
@@ -57,7 +57,8 @@ def apply_box(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) -> 
     """Return bool [H, W], the mask `before` with the thing inside the last mark, a box, added or removed.
 
     The network proposes things. If the box has no size, the thing is taken that the network is surest of, and whose own
-    bounding box is most like the box. Without a network, colors separate the thing from what surrounds the box.
+    bounding box is most like the box. Without a network, colors separate the thing from what surrounds the box. If
+    nothing is found, the thing is the whole box.
 
     Args:
         marks: all marks of the view so far. Pixels that they confirm to be the opposite do not change.
@@ -125,7 +126,7 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) 
 
 
 def _leaves_speck(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
-    """Return whether a correction shrinks the region around one of `points` from `least` px or more to fewer."""
+    """Return whether a correction cuts the connected region (mask or rest) at one of `points` to below `least` px."""
 
     def is_speck(mask: np.ndarray, at: np.ndarray) -> bool:
         return bool(part_at(mask == value_at(before, at), at).sum() < least)
@@ -134,7 +135,7 @@ def _leaves_speck(before: np.ndarray, after: np.ndarray, points: np.ndarray, lea
 
 
 def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
-    """Return the penalty on a correction's merit for growth, shrinkage, or a change of less than `dot` pixels."""
+    """Return the penalty >= 0 on a correction's merit for growth, shrinkage, and a change below `dot` pixels."""
     growth = float(np.log(max(after.sum(), 1) / max(before.sum(), 1)))
     # a person hardly clicks to change less than a dot around the click
     tiny = max(0.0, 1 - float((after ^ before).sum()) / dot)
@@ -142,7 +143,7 @@ def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
 
 
 def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
-    """Return the mask, corrected around clicks that contradict it, up to changes of color and edges of the relief."""
+    """Return the mask `before`, changed around contradicting clicks up to changes of color and edges of the relief."""
     lab, small, marks = downscale(view.image, clicks)
     before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
     grid = pixel_pairs(small)

@@ -19,8 +19,9 @@ class Event:
 
     Attributes:
         view: name of the view.
-        is_early: True if it was made before there were masks of all views. The person then saw the mask of this view
-            alone, as its own marks make it.
+        mark: the mark, in pixels of the view.
+        is_early: True if the mark was made before there were masks of all views. The person then saw only the mask of
+            this view, as the view's own marks make it.
     """
 
     view: str
@@ -35,7 +36,7 @@ class Event:
 
 
 def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[Event]], list[list[Event]]]:
-    """Return the events that select the object, view -> events, and the corrections in groups of one view each.
+    """Split events into those that select the object, view -> events, and corrections, in groups of one view each.
 
     The object is selected by the early events in views that have no given mask and a positive early event. If there are
     neither such events nor given masks, it is selected by the first event and the clicks and boxes in the same view
@@ -59,5 +60,5 @@ def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[
 
 
 def group_by_view(events: Sequence[Event]) -> list[list[Event]]:
-    """Return the events in groups of those that follow each other in one view."""
+    """Return the events in their order, grouped while the view stays the same; a view may have several groups."""
     return [list(group) for _, group in groupby(events, key=lambda event: event.view)]

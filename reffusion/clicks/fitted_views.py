@@ -34,25 +34,25 @@ class FittedViews:
 
     @cached_property
     def network_views(self) -> frozenset[str]:
-        """The views in which the network is asked for the object that other views show, evenly spread by name."""
+        """Up to `MAX_NETWORK_VIEWS` views, evenly spread by name, in which the network is asked for the object."""
         return frozenset(sample_evenly(sorted(self.cameras), MAX_NETWORK_VIEWS))
 
     def depth(self, name: str) -> np.ndarray:
-        """Return the depth of the surface that a view shows, [H, W] camera z."""
+        """Return the depth of the surface that a view shows, [H, W] camera z; the view must have a relief."""
         relief = self.evidence_of(name).relief
         assert relief is not None
         return np.exp(relief / self.cameras[name].fx)
 
     def surface(self, name: str) -> np.ndarray:
-        """Return the surface points that a view shows, [H, W, 3]."""
+        """Return the surface points that a view shows, [H, W, 3] in world coordinates."""
         return geometry.unproject(self.depth(name), self.cameras[name])
 
 
 def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> list[Mark]:
     """Return the marks of other views as clicks in one view, where this view shows the marked surface points.
 
-    Each point of a stroke's path becomes a click; a box becomes none. A correction of this view leaves pixels unchanged
-    that these clicks confirm.
+    Each point of a stroke's path becomes a click. A box becomes none, and neither does a point that is hidden in this
+    view or outside the picture. A correction of this view leaves pixels unchanged that these clicks confirm.
 
     Args:
         events: all marks so far; those in the view `name` itself are not used.

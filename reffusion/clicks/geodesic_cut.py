@@ -103,7 +103,7 @@ def nested_candidates(
 def _cut_within(
     inside_of: np.ndarray, true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray
 ) -> np.ndarray:
-    """Return the labels [N] of `min_cut` if only the nodes in `inside_of`, bool [N], may become True."""
+    """Return the labels, bool [N], of `min_cut` if only the nodes in `inside_of`, bool [N], may become True."""
     ends, at = inside_of[pairs], np.cumsum(inside_of) - 1
     both, crossing = ends.all(1), ends[:, 0] != ends[:, 1]
     inner = np.where(ends[crossing, 0], pairs[crossing, 0], pairs[crossing, 1])
@@ -188,13 +188,13 @@ def correct_labels(
 
 
 def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the cost [E] of a border between neighbors, low where `step` (`color_steps`) exceeds its usual size."""
+    """Return the cost [E] of a border between neighbors, low where `step` (`color_steps`) is large for this graph."""
     usual = float((step**2).sum()) / max(len(step), 1)  # mean square
     return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
 
 
 def keep_connected(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Return bool [N], the labelled nodes that a path of labelled nodes connects with a labelled seed.
+    """Return bool [N], the labeled nodes that a path of labeled nodes connects with a labeled seed.
 
     Args:
         labels: bool [N].
@@ -211,7 +211,7 @@ def relative_distance(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, 
     """Return [N] in [-1, 1], how much nearer each node is to the nodes in `these` than to the nodes in `those`.
 
     With the lengths a and b of the shortest paths to `these` and `those`, the value is (b - a) / (a + b): 1 at `these`,
-    -1 at `those`.
+    -1 at `those`. If `these` (or `those`) has no node, a (or b) is 1 everywhere.
 
     Args:
         pairs: int [E, 2], neighbors.
@@ -224,7 +224,7 @@ def relative_distance(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, 
 
 
 def _distance(graph: sparse.csr_array, start: np.ndarray) -> np.ndarray:
-    """Return the length [N] of the shortest path from any `start` node; over twice the largest if there is no path."""
+    """Return the length [N] of the shortest path from a `start` node; without a path, a large one; 1 without starts."""
     if not start.any():
         return np.ones(graph.shape[0])
     found = csgraph.dijkstra(graph, directed=False, indices=np.flatnonzero(start), min_only=True)
@@ -244,7 +244,7 @@ def color_frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def color_histogram(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return [BINS, BINS, BINS], a slightly blurred histogram of colors; arguments as for `color_frequency`."""
+    """Return [BINS, BINS, BINS], a slightly blurred histogram of L*, a*, b*; arguments as for `color_frequency`."""
     count = np.zeros((BINS,) * 3)
     np.add.at(count, _bins(lab), weight)
     return ndimage.gaussian_filter(count, 0.7, mode="nearest")

@@ -22,13 +22,13 @@ def bounding_box(mask: np.ndarray) -> tuple[float, float, float, float]:
 def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the mask with its border moved to changes of color by GrabCut.
 
-    The border moves by at most the share `BAND` of the larger image side. The mask is returned unchanged if the mask or
-    its surroundings have fewer than 10 pixels.
+    The border moves by at most the share `BAND` of the larger image side. The mask is returned as it is if the mask or
+    its surroundings have fewer than `LEAST_PIXELS` pixels.
 
     Args:
         image: uint8 [H, W, 3].
         mask: bool [H, W].
-        marks: int8 [H, W]; GrabCut keeps the pixels marked OBJECT inside the mask and those marked OTHER outside.
+        marks: int8 [H, W] as from `mark_pixels`; OBJECT pixels stay inside the mask, and OTHER pixels outside.
     """
     if not mask.any():
         return mask
@@ -52,7 +52,8 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
 def find_thing_in_box(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the thing inside a box, found by GrabCut: its colors are rare around the box.
 
-    Colors are compared up to the box's own size away from it. The result is empty if the box has no surroundings.
+    Colors are compared up to the box's own size away from the box. The result is empty if the box or its surroundings
+    have fewer than `LEAST_PIXELS` pixels.
 
     Args:
         image: uint8 [H, W, 3].

@@ -57,7 +57,7 @@ def find_depth_edges(
     """Return [E] in [0, 1], how surely the two pixels of a pair lie on different surfaces, one behind the other.
 
     Args:
-        relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet, which gives None.
+        relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet, and then the result is None.
         small: (h, w), the size for segmentation.
         pairs: int [E, 2], neighboring pixels at this size.
         length: [E], their distances in pixels.
@@ -72,15 +72,17 @@ def find_depth_edges(
 
 
 def value_at(mask: np.ndarray, at: np.ndarray) -> bool:
-    """Return the value of a mask, bool [H, W], at the point `at` = (x, y) in pixels, or at the nearest pixel."""
+    """Return the value of a mask, bool [H, W], at (x, y) = `at` in pixels; outside the picture, at its border."""
     return bool(mask[_pixel_at(mask, at)])
 
 
 def part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the connected part of a mask that contains a point; all False if the point is outside.
+    """Return bool [H, W], the connected part (8-neighborhood) of a mask that contains a point.
+
+    The result is all False if the mask is False at the point.
 
     Args:
-        at: (x, y) in pixels.
+        at: (x, y) in pixels, see `value_at`.
     """
     if not value_at(mask, at):
         return np.zeros_like(mask)

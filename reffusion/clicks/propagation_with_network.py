@@ -111,12 +111,12 @@ def propagate_masks(
 
     Args:
         cameras: view -> Camera, all views.
-        evidence_of: function from a view to its photograph and segmentation network.
-        masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
-        network_views: the views in which the network is asked. In other views, and in those without a network (`ask`
-            is None), and in all views if the masks show a thin thing, the mask is the projection of the votes.
-        former: view -> bool [H, W], the masks of all views before a correction; None if there are none. They change
-            only where the votes contradict them.
+        evidence_of: function from a view's name to its photograph, relief and segmentation network.
+        masks: view -> bool [H, W], the known masks, at least one, which are returned unchanged.
+        network_views: the views in which the network is asked. In other views, in those without a network (`ask` is
+            None), and in all views if all masks show a thin thing, the mask is the projection of the votes.
+        former: view -> bool [H, W], the masks of all views before a correction; None if there are none. These
+            masks change only where the votes contradict them.
     """
     ballots = {name: find_voting_pixels(mask, evidence_of(name).relief) for name, mask in masks.items()}
     drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks, ballots)
@@ -139,7 +139,7 @@ def propagate_masks(
 
 
 def is_thin(mask: np.ndarray) -> bool:
-    """Return True if no disk fits into a mask, bool [H, W], with a radius above the share `THIN` of the larger side."""
+    """Return True if each disk inside a mask, bool [H, W], has a radius below the share `THIN` of the larger side."""
     return bool(ndimage.distance_transform_edt(mask).max() < THIN * max(mask.shape))
 
 
@@ -173,7 +173,7 @@ def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarra
 
 
 def change_where_votes_agree(former: np.ndarray, new: np.ndarray, projection: Projection) -> np.ndarray:
-    """Return bool [H, W], the former mask of a view, changed in the connected regions where the votes are for it.
+    """Return bool [H, W], the former mask of a view, with those connected changes that the votes support.
 
     Args:
         former, new: bool [H, W], the masks before and after a correction.
@@ -220,7 +220,7 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray, voting: 
 
 
 def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
-    """Add votes against the object for Gaussians without a label on planes beside the object (see `support_planes`)."""
+    """Return the votes, with votes against the object for unlabeled Gaussians on supports (`support_planes`)."""
     known, share = votes.has_label, votes.shares
     means = gaussians.means.detach().double().cpu().numpy()
     assumed = find_support_gaussians(means, share > 0.5, known & (share < MAX_OTHER_SHARE)) & ~known
@@ -229,9 +229,9 @@ def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
 
 @torch.no_grad()
 def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Projection:
-    """Render the votes on Gaussians into a view, as far as Gaussians have more than `votes.least` votes.
+    """Render the votes on Gaussians into a view. Gaussians without a label (`Votes.has_label`) add nothing.
 
-    A Gaussian belongs to the object's silhouette if more than half of its votes are for the object.
+    A Gaussian belongs to the object's silhouette if it has a label, and more than half of its votes are for the object.
     """
     share = votes.shares
     labels = torch.as_tensor(share > 0.5, device=gaussians.means.device)
@@ -311,7 +311,7 @@ def _find_excluded(projection: Projection) -> np.ndarray:
 
 
 def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:
-    """Return the network's masks for all prompts, each with the bonus to its merit."""
+    """Return the network's last two masks for each prompt (`parts`: three), each with the bonus to its merit."""
     assert view.ask is not None
     # masks go from part to whole; the last one, that of the largest object, gets the bonus
     answers = [view.ask(prompt)[-3 if parts else -2 :] for prompt in prompts]
@@ -389,7 +389,7 @@ def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
 
 
 def deepest_points(mask: np.ndarray) -> Clicks:
-    """Return up to `POINTS` positive clicks inside a mask, far from its border and from each other; at least one."""
+    """Return 1 to `POINTS` positive clicks inside a mask that is not empty, far from its border and each other."""
     depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     least, points = max(MIN_DEPTH * depth.max(), MIN_DEPTH_PX), []
     rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]

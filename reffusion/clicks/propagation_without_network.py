@@ -2,7 +2,7 @@
 
 The masks vote on the Gaussians: the vote of a mask is the blending weight of a Gaussian, summed over the pixels inside
 the mask (for the object) or outside the mask (against the object). A minimum cut between neighboring Gaussians labels
-the Gaussians that have no votes. In each view the silhouette of the labelled Gaussians is moved to the edges of the
+the Gaussians that have no votes. In each view the silhouette of the labeled Gaussians is moved to the edges of the
 photograph.
 """
 
@@ -62,7 +62,7 @@ def label_gaussians(
 
     Votes of the masks label the Gaussians that the views with masks show. Gaussians whose centers project beside a mask
     count as background, unless the masks vote for them. A minimum cut labels all other Gaussians. The cut uses the
-    distances to labelled Gaussians, the colors of the photographs without masks, and the similarity of neighbors. The
+    distances to labeled Gaussians, the colors of the photographs without masks, and the similarity of neighbors. The
     result contains only Gaussians that a chain of object neighbors connects with a Gaussian that votes label as the
     object.
 
@@ -108,7 +108,7 @@ def label_gaussians(
 def object_mask(gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the object's mask in a view.
 
-    It is the silhouette of the labelled Gaussians, with the border moved to the edges of the photograph.
+    This is the silhouette of the object's Gaussians, with the border moved to the edges of the photograph.
 
     Args:
         labels: bool [N], True = the object.

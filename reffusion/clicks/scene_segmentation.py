@@ -61,8 +61,8 @@ def segment_scene(
         events: the marks, in the order in which they were made.
         given: view -> bool [H, W], masks that the scene provides. Only an event in the same view changes such a mask.
         recall: cache of the results after each group of events, so that further events do not repeat the work for the
-            earlier ones. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
-            The key holds the events only, so different scenes or given masks must not share a cache.
+            earlier ones. The function maps (key, compute) to the stored masks for this key, else to the result of
+            compute(). The key holds the events only, so different scenes or given masks must not share a cache.
         settled: the masks after the first of the events, which are then not computed anew; None for none.
     """
     if settled is not None:
@@ -188,7 +188,7 @@ def correct_scene(
 
 
 def _is_allowed(events: Sequence[Event], name: str, mask: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], False for the pixels of a view that its marks confirm not to be the object."""
+    """Return bool [H, W], False where marks of the view `name` confirm that a pixel is not the object."""
     return confirmed_pixels([event.mark for event in events if event.view == name], mask.shape) != OTHER
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from reffusion.clicks.marks import Clicks
 
-# Mean and standard deviation of ImageNet's pixels, by which the inputs of these networks are normalised.
+# Mean and standard deviation of ImageNet's pixels, by which the inputs of these networks are normalized.
 MEAN, DEVIATION = np.array((0.485, 0.456, 0.406), np.float32), np.array((0.229, 0.224, 0.225), np.float32)
 NEGATIVE, POSITIVE, UPPER_LEFT, LOWER_RIGHT = 0, 1, 2, 3  # SAM's labels of points and of a box's corners
 
@@ -27,7 +27,7 @@ class Segmenter:
     Attributes:
         name: name of the network for messages.
         side: side of the square input, px.
-        encode: normalised picture float32 [1, 3, side, side] -> features of the picture.
+        encode: normalized picture float32 [1, 3, side, side] -> features of the picture.
         decode: (features, points float32 [K, 2] in pixels of the input, labels int [K]: NEGATIVE, POSITIVE, UPPER_LEFT
             or LOWER_RIGHT) -> (logits float32 [M, h, w] of M masks of the whole square, > 0 on the object, expected IoU
             [M]). The masks go from a part to the whole; the last one is that of the largest object.

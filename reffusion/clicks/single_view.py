@@ -101,10 +101,10 @@ def select_object(
     """Return the mask that best outlines one complete object, among the masks that agree with all clicks.
 
     The merit of a mask is its `object_score`, plus the share of its border that lies on edges of surfaces, minus its
-    penalty. None if no mask agrees with all clicks.
+    penalty. The result is None if no mask agrees with all clicks.
 
     Args:
-        penalties: of each mask; None for no penalties.
+        penalties: the penalty of each mask; None for no penalties.
     """
     agreeing = _agreeing(clicks, masks)
     if len(agreeing) < 2:
@@ -160,7 +160,7 @@ def segment_by_surfaces(
 def _select_candidate(
     candidates: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray
 ) -> np.ndarray | None:
-    """Return the candidate of best `object_score`; None if all have tiny regions or depth shows no edge around it."""
+    """Return the candidate [h, w] of best `object_score`; None if all have tiny regions, or it lacks edges in depth."""
     whole = [each for each in (_fill_holes(labels, marks) for labels in candidates) if _has_regions(each, marks)]
     if not whole:
         return None

@@ -1,7 +1,7 @@
 """Planes beside the object, such as the floor, a table or the top of a plinth, as evidence for what is not the object.
 
 The first masks label only the Gaussians that their views show. Elsewhere a segmentation network may take the object
-and what it stands on for one thing, such as a statue and its plinth of the same stone. The labelled part of the plinth
+and what it stands on for one thing, such as a statue and its plinth of the same stone. The labeled part of the plinth
 lies on planes. Gaussians without a label on the same planes belong to the plinth, too, until masks of further views
 label them.
 """
@@ -30,8 +30,8 @@ def find_support_gaussians(means: np.ndarray, is_object: np.ndarray, is_other: n
 
     Args:
         means: [N, 3] positions of the Gaussians.
-        is_object: bool [N], Gaussians labelled as the object.
-        is_other: bool [N], Gaussians labelled as not the object. Gaussians in neither array have no label.
+        is_object: bool [N], Gaussians labeled as the object.
+        is_other: bool [N], Gaussians labeled as not the object. Gaussians in neither array have no label.
 
     Returns:
         bool [N], True for the Gaussians on these planes, whatever their label. False far from the object (`REACH`), and

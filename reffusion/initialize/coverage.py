@@ -98,7 +98,7 @@ def find_uncovered(
 
 
 def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels at which a rendering contradicts a plausible mirror image."""
+    """Return bool [H, W], where a rendering contradicts a plausible mirror image, whose camera z is `image_depth`."""
     depth, is_new = (each.cpu().numpy() for each in (rendering.depth, rendering.features[..., 0] > 0.5))
     # The rendering contradicts the image (`image_depth` is its camera z, inf where there is none) where the rendered
     # surface lies behind the image. It also does so where the rendered surface lies in front of the image, no reference
@@ -117,8 +117,8 @@ def find_floaters(
         is_new: bool [N], True for the Gaussians that references added; these are never floaters.
         background: the photographs and surfaces around the object.
         uncovered: view name -> bool [H, W], the result of `find_uncovered`.
-        tau: a Gaussian is a floater if its blending weights in uncovered pixels, summed over all views, exceed `tau`
-            times those in all other pixels.
+        tau: a Gaussian is a floater if its blending weights in uncovered pixels, summed over the views in `uncovered`,
+            exceed `tau` times those in all other pixels of these views.
     """
     return voting.find_floaters(gaussians, background.cameras, uncovered, tau) & ~is_new
 
@@ -128,6 +128,8 @@ def completed_views(
     references: Sequence[Reference], gaussians: Gaussians, background: Background
 ) -> list[tuple[DepthView, np.ndarray]]:
     """Convert references to sources of texture for further views.
+
+    Each reference must be a view of `background.views`.
 
     Returns:
         For each reference its depth view and its picture, uint8 [H, W, 3]. The depth is that of `gaussians`, rendered
@@ -160,7 +162,7 @@ def cameras_near_photographs(background: Background) -> list[Camera]:
 def least_covered_view(
     cameras: Sequence[Camera], background: Background, uncovered: Mapping[str, np.ndarray]
 ) -> Camera | None:
-    """Return the camera of the view with the most uncovered pixels.
+    """Return the camera of the view with the most uncovered pixels, counted absolutely.
 
     Args:
         cameras: the candidates.
@@ -168,7 +170,8 @@ def least_covered_view(
         uncovered: view name -> bool [H, W], the result of `find_uncovered`.
 
     Returns:
-        None if in no view more than `MIN_SHARE` of C is uncovered.
+        The camera; None if in no view more than `MIN_SHARE` of C is uncovered. A view with a smaller share is not
+        returned, however many its uncovered pixels are.
     """
     candidates = [
         camera
@@ -179,7 +182,7 @@ def least_covered_view(
 
 
 def is_narrow(mask: np.ndarray) -> bool:
-    """Return whether a mask, bool [H, W], is nowhere wider than `NARROW`, so that its content shows no texture."""
+    """Return whether a mask, bool [H, W], is too narrow to show texture: nowhere wider than `NARROW`; True if empty."""
     distance = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return 2 * float(distance.max()) <= NARROW * mask.shape[1]
 
@@ -188,12 +191,11 @@ def is_narrow(mask: np.ndarray) -> bool:
 def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the reference's pixels outside C whose surface lies clearly in front of the rendered draft.
 
-    Pixels at which the draft has an alpha up to 0.5 count as in front of everything.
-
-    Most of these pixels show the inner side of a surface that an earlier reference added.
+    Where the draft has an alpha up to 0.5, every surface is in front of it. At most of the other pixels the draft shows
+    the inner side of a surface that an earlier reference added.
 
     Args:
-        gaussians: of the draft.
+        gaussians: the Gaussians of the draft.
         depth: [H, W], camera z of the surface that the reference shows.
         reference: the completed view; only pixels of its mask are returned.
         mask: bool [H, W], C of the view.

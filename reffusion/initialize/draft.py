@@ -49,6 +49,6 @@ class Draft:
         return Draft(self.gaussians.map(lambda p: p[~dropped]), self.origin[~dropped])
 
     def add(self, added: Gaussians, origin: int) -> Draft:
-        """Return the draft with new Gaussians of one origin appended."""
+        """Return the draft with new Gaussians appended, all of one origin: REFERENCE, EXTRA_VIEW or RANDOM."""
         together = self.gaussians.zip_map(added, lambda a, b: torch.cat([a, b]))
         return Draft(together, torch.cat([self.origin, self.origin.new_full((len(added),), origin)]))

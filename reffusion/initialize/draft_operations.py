@@ -48,12 +48,13 @@ def restrict_invent_masks(draft: Draft, sets: Mapping[str, MaskSet], background:
 
 
 def add_random(draft: Draft, space: Workspace, count: int) -> Draft:
-    """Return the draft with `count` random Gaussians added in the region of the hole.
+    """Return the draft with up to `count` random Gaussians added where a box projects into the invent masks.
 
-    The region is the box that scene.yaml names (`region`), or else the bounding box of the object's Gaussians.
+    The box is the one that scene.yaml names (`region`), or else the bounding box of the object's Gaussians. Fewer
+    Gaussians are added if the box hardly meets the invent masks (`random_init.sample_points`).
 
     Raises:
-        ValueError: there is neither a region nor an object, or the region does not meet the invent masks.
+        ValueError: there is neither a region nor an object, or the box does not meet the invent masks.
     """
     scene, region = space.scene, space.facts.get("region")
     removed = space.gaussians.map(lambda p: p[space.object_labels])
@@ -89,13 +90,13 @@ def refit_draft(
 
     Args:
         draft: the filled scene.
-        steps: number of optimisation steps, one view each.
+        steps: number of optimization steps, one view each.
         scene: tells which views are clean (the object is absent) and which have no photograph.
         background: holds the photographs and where they show the object.
-        trusted: completed views; the mask of each marks the pixels that supervise.
+        trusted: completed views; the mask of each marks the pixels that supervise. Empty masks are allowed.
         sets: view name -> pixel classes.
         has_exact_depth: True if each reference has a depth map of its own. Then the new Gaussians hardly move.
-        folder: receives the trace and the checkpoints.
+        folder: receives the trace and the checkpoints; a run that was interrupted resumes from its checkpoint.
     """
     invented = lambda name: sets[name].invent & (name not in scene.clean)  # no photograph shows these pixels
     views = [view for view in background.views if view.camera.name not in scene.camera_only]

@@ -33,7 +33,9 @@ def complete_extra_views(
 ) -> tuple[Draft, list[Reference], dict[str, np.ndarray]]:
     """Complete the view with most uncovered pixels, add it to the draft, and repeat, up to `params.extra_views` times.
 
-    Before the first view, floaters are removed (`coverage.find_floaters`).
+    Before the first view, floaters are removed (`coverage.find_floaters`). The loop ends early if no view has enough
+    uncovered pixels (`coverage.least_covered_view`). A view whose depth cannot be estimated is left as it is. A line is
+    printed for each view.
 
     Args:
         params: parameters of the stage `initialize`.
@@ -82,7 +84,7 @@ def complete_extra_views(
 
 
 def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None) -> np.ndarray:
-    """Return a view of the draft, uint8 [H, W, 3], whose uncovered pixels `hole` are completed in 2D."""
+    """Return a view of the draft, uint8 [H, W, 3], whose uncovered pixels `hole` and their rim are completed in 2D."""
     mask = sources.masks[camera.name]
     # Just outside C a photograph may still show the object's rim; the inpainter would continue this rim into the hole.
     photo = sources.photos[camera.name]

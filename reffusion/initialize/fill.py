@@ -65,7 +65,7 @@ def fill_references(
         log: receives the traces of the depth solvers.
 
     Returns:
-        The filled draft, and view name -> [H, W], the depth at which the reference was added.
+        The filled draft, and view name -> [H, W], the camera z at which the reference was added.
 
     Raises:
         ValueError: as `unprojection.estimate_depth`.
@@ -97,7 +97,7 @@ def fill_reference(
 
     Pixels of C (the object's mask) at which the draft is not opaque, or beside which another view would show a gap, are
     added too. Inside C the reference shows the background, whose depth is estimated. Outside C it may draw an inserted
-    object over the remaining scene.
+    object over the remaining scene. A line that says how the depth was found is printed.
 
     Args:
         params: parameters of the stage `initialize`.
@@ -195,10 +195,10 @@ def insert_object(
     share: Share | None,
     is_estimated: bool,
 ) -> tuple[Surface, np.ndarray, np.ndarray]:
-    """Give the object that a reference draws over the remaining scene a depth.
+    """Extend a reference's surface by the object that the reference draws over the remaining scene.
 
-    With a depth map or a depth model, pixels whose estimate lies in front of the scene show the object. Without them it
-    is a billboard that stands where it meets the scene.
+    With a depth map or a depth model, pixels whose estimate lies in front of the scene show the object. Without both
+    the object is a billboard that stands where it meets the scene.
 
     Args:
         surface: the reference's surface in the hole.

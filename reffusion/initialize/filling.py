@@ -67,6 +67,10 @@ def initialize_scene(
         given: names of the references that the scene brings, see `extend_given_masks`.
         work: folder of the refit's trace and checkpoints, which is deleted in the end.
         log: receives the traces of the depth solvers.
+
+    Returns:
+        The filled scene. Without references nothing is filled. With `params.start` "random", random Gaussians take the
+        place of the Gaussians that the references would add, about as many.
     """
     draft = Draft.start(space.remaining)
     if params.tidy and params.start != "nothing":  # if nothing is filled in, floaters look better than a hole
@@ -92,7 +96,9 @@ def fill_hole(
     given: Collection[str],
     log: Trace,
 ) -> Filling:
-    """Fill the hole from the references, and from extra views where these leave gaps.
+    """Fill the hole from the references, and from extra views where the references leave gaps.
+
+    With `params.refit_steps`, the photographs are also relit without the object's shadow (`remove_shadows`).
 
     Args:
         filling: the scene without the object, not yet filled.
@@ -121,7 +127,7 @@ def fill_hole(
 
 
 def _refit(params: Params, filled: Filling, space: Workspace, references: Sequence[Reference], work: Path) -> Draft:
-    """Refit a filled scene to photographs, completed views, and the references warped to other views."""
+    """Refit a filled scene to photographs, completed views, and references warped to other views; delete `work`."""
     assert filled.background is not None
     work.mkdir(exist_ok=True)
     has_exact_depth = all(each.depth is not None for each in references)

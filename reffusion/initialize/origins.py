@@ -55,7 +55,7 @@ class OriginMap:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Origin -> share of the pixels that have one; all 0 if none has."""
+        """Origin, except "outside" -> its share in [0, 1] of the pixels that are not outside; 0 without such pixels."""
         counts = np.bincount(self.classes.ravel(), minlength=len(ORIGINS))[1:]
         return {origin: float(count / max(counts.sum(), 1)) for origin, count in zip(ORIGINS[1:], counts, strict=True)}
 
@@ -89,7 +89,7 @@ def find_origins(draft: Draft, camera: Camera, masks: MaskSet, background: Backg
 
 
 def _find_conflicts(rendering: Rendering, camera: Camera, pixels: np.ndarray, background: Background) -> np.ndarray:
-    """Return bool [H, W], the `pixels` whose surface photographs show in another color than the rendering does."""
+    """Return bool [H, W], those of `pixels` whose color differs from most photographs that show the surface."""
     grid = np.zeros_like(pixels)
     grid[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE] = True
     rows, columns = np.nonzero(pixels & grid)

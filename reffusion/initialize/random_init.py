@@ -76,7 +76,7 @@ def random_gaussians(points: np.ndarray, sh_count: int, antialiased: bool, gener
         points: [N, 3], N at least 4.
         sh_count: number of spherical harmonic coefficients of a Gaussian, (degree + 1)^2.
         antialiased: whether the Gaussians are meant for Mip-Splatting's 2D filter, see `types.Gaussians`.
-        generator: draws the colors.
+        generator: draws the colors; its state changes.
     """
     colors = torch.randint(256, (len(points), 3), generator=generator, dtype=torch.uint8).numpy()
     degree = round(sh_count**0.5) - 1

@@ -60,14 +60,14 @@ class ReferenceSurface:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """[H, W, 3], unit normals of the surface, towards the camera."""
+        """[H, W, 3], unit normals of the surface, toward the camera."""
         return surface_normals(self.depth, self.camera)
 
     @cached_property
     def footprints(self) -> np.ndarray:
         """[H, W], the length of a pixel's footprint on the surface along its longest direction, in world units.
 
-        It grows with depth and with the slant of the surface; it is infinite where depth is unknown.
+        The length grows with depth and with the slant of the surface; it is infinite where depth is unknown.
         """
         rays = geometry.unproject(np.ones_like(self.depth), self.camera) - self.camera.center
         direction = rays / np.linalg.norm(rays, axis=-1, keepdims=True)

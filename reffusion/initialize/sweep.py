@@ -36,8 +36,8 @@ def refine_background(background: Background, camera: Camera, hole: np.ndarray) 
     Args:
         background: the photographs, depth views and planes around the object.
         camera: the view.
-        hole: bool [H, W], the pixels to be filled. Depth is searched in a ring around
-            the hole and the object, outside the hole.
+        hole: bool [H, W], the pixels to be filled. Depth is searched in a ring around the hole and the object, outside
+            the hole.
 
     Returns:
         The background with corrected depth and planes, and bool [H, W], the pixels at which the sweep found depth.
@@ -73,7 +73,8 @@ def sweep_depth(
         photos: view name -> uint8 [H, W, 3], the photographs of `views`.
 
     Returns:
-        0 outside `pixels` and where no depth agrees well enough; everywhere if there are fewer than two neighbors.
+        The depth; 0 outside `pixels`, and where no depth agrees well enough. All 0 if there are fewer than two
+        neighbors.
     """
     found = np.zeros(pixels.shape)
     pixels = pixels & (depth > 0)
@@ -103,14 +104,14 @@ def sweep_depth(
 
 
 def _smooth_depth(depth: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
-    """Return the depth map [H, W] after a median filter with a window of `side` px."""
+    """Return the depth map [H, W] after a median filter of `side` px, with pixels that are not `known` filled first."""
     # Before, each pixel that is not `known` takes the depth of the nearest known pixel.
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return ndimage.median_filter(depth[tuple(nearest)].astype(np.float64), side)
 
 
 def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthView]) -> list[DepthView]:
-    """Return up to `NEIGHBORS` views that see a point from a different, but not too different, direction."""
+    """Return up to `NEIGHBORS` views whose direction to a point is `MIN_ANGLE` to `MAX_ANGLE` off that of `camera`."""
     direction = lambda center: (center - point) / max(np.linalg.norm(center - point), 1e-12)
     angles = [
         np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views
@@ -134,9 +135,9 @@ def _correlation(
     photos: Mapping[str, np.ndarray],
     side: int,
 ) -> np.ndarray:
-    """Return [H, W], how well the neighbors' photographs agree with the view's if the surface is at given points."""
+    """Return [H, W] in [-1, 1], how well the neighbors' photographs agree with the view's for a surface at `points`."""
     mean = lambda values: cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
-    # The value is the normalised correlation of windows of `side` px over the `known` pixels, averaged over the better
+    # The value is the normalized correlation of windows of `side` px over the `known` pixels, averaged over the better
     # half of the neighbors. A neighbor whose window cannot be compared counts as -1.
     scores = []
     for view in neighbors:

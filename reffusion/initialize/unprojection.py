@@ -187,7 +187,7 @@ def add_surface(
 def match_colors(
     gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
 ) -> Gaussians:
-    """Return all Gaussians, the colors of the labelled ones corrected so that a rendered view shows a given picture.
+    """Return all Gaussians, the colors of the labeled ones corrected so that a rendered view shows a given picture.
 
     Only the constant spherical harmonic changes. Each step adds to the color of a Gaussian the mean residual of the
     pixels that it is blended into, weighted by its blending weights. This undoes the blur of the footprints. A Gaussian
@@ -217,7 +217,7 @@ def match_colors(
 
 
 def _color_bounds(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the lowest and the highest constant harmonic that each Gaussian may have, [N, 3] each."""
+    """Return the lowest and highest constant harmonic of each Gaussian, [N, 3] each, from the picture around it."""
     uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
     # The bounds are the colors of the picture within `COLOR_WINDOW_PX` of the Gaussian's center, with a margin of
     # `COLOR_MARGIN`.

@@ -113,7 +113,7 @@ def transfer_sh(
     """Return all Gaussians, the new ones with harmonics whose color changes as that of the surface around them does.
 
     For every view, each new Gaussian takes the mean change of color of the neighboring samples, weighted by distance
-    and similarity of color, and shrunk towards 0 where the samples disagree. Its harmonics are a least squares fit to
+    and similarity of color, and shrunk toward 0 where the samples disagree. Its harmonics are a least squares fit to
     these changes. Seen from `camera`, the Gaussian keeps its color.
 
     Args:
@@ -124,7 +124,8 @@ def transfer_sh(
         views: the V views of `change`.
 
     Returns:
-        All N Gaussians. They are unchanged if their harmonics are of degree 0, or if there are too few samples.
+        All N Gaussians. They are unchanged if their harmonics are of degree 0, or if `change` has fewer than
+        `NEIGHBORS` samples.
     """
     indices = torch.nonzero(is_new)[:, 0]
     if gaussians.sh_degree == 0 or not len(indices) or len(change.points) < NEIGHBORS:
@@ -151,7 +152,7 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
         weighted = row * weight[:, number, None]
         normal += weighted[:, :, None] * row[:, None]
         right += weighted[:, :, None] * target[:, number, None]
-    # These non-constant harmonics c_k minimise the sum of squares in docs/method.md#initialization (view-dependent
+    # These non-constant harmonics c_k minimize the sum of squares in docs/method.md#initialization (view-dependent
     # color).
     rest = torch.linalg.solve(normal, right)
     constant = constant - (base[..., None] * rest).sum(1) / SH0
@@ -159,7 +160,7 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
 
 
 def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean change of color around each Gaussian in each view, [N, V, 3], and where it is known, [N, V]."""
+    """Return [N, V, 3], mean changes of color around Gaussians of colors `own` [N, 3], and [N, V], which are known."""
     # `own` are the colors of the Gaussians in `change.material`.
     distance, index = cKDTree(change.points).query(means, k=NEIGHBORS)
     near = np.exp(-0.5 * (distance / np.maximum(distance[:, -1:] / 2, 1e-12)) ** 2)

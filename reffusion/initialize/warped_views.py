@@ -39,7 +39,7 @@ class _Surface(NamedTuple):
     Attributes:
         camera: the view of the reference.
         depth: [H, W], camera z; 0 where unknown.
-        points, normals: [H, W, 3], in the world; the normals have unit length and point towards the camera.
+        points, normals: [H, W, 3], in the world; the normals have unit length and point toward the camera.
     """
 
     camera: Camera
@@ -48,9 +48,9 @@ class _Surface(NamedTuple):
     normals: np.ndarray
 
     def predict_coverage(self, camera: Camera, pixels: np.ndarray) -> float:
-        """Return how many pixels of another view the pixels bool [H, W] would cover, divided by their number.
+        """Return the area in px that `pixels`, bool [H, W], would cover in another view, divided by their number.
 
-        It does not matter what occludes the surface there.
+        Occlusion is ignored. The result is 0 if the other view sees none of the pixels or only the surface's back.
         """
         points, normals = self.points[pixels], self.normals[pixels]
         uv, z = geometry.project(points, camera)
@@ -67,16 +67,17 @@ class _Surface(NamedTuple):
 def warp_references(
     draft: Draft, references: Sequence[Reference], depths: Mapping[str, np.ndarray], cameras: Sequence[Camera]
 ) -> list[Reference]:
-    """Warp each reference to views from very different directions.
+    """Warp each reference to up to `VIEWS` views from very different directions.
 
     Args:
         draft: the filled scene.
-        references: the completed views; those without a depth map, or with an empty mask, are left out.
+        references: the completed views; those without an entry in `depths`, or with an empty mask, are left out.
         depths: view name -> [H, W], camera z of the surface onto which the reference was unprojected; 0 where unknown.
         cameras: the views to choose from.
 
     Returns:
-        Completed views. The mask of each marks the pixels that show new Gaussians and to which a reference was warped.
+        Completed views, in the order of the references. The mask of each marks the pixels that show new Gaussians and
+        to which a reference was warped; outside the mask the picture is black.
     """
     warped = []
     for reference in references:
@@ -107,7 +108,7 @@ def _choose_views(surface: _Surface, pixels: np.ndarray, cameras: Sequence[Camer
 
 @torch.no_grad()
 def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) -> Reference:
-    """Return another view of the picture uint8 [H, W, 3] of a surface."""
+    """Return the view `camera` of a surface's picture, uint8 [H, W, 3]; its mask marks the pixels that show it."""
     is_new = draft.is_new[:, None].to(draft.gaussians.means)
     rendering = rasterizer.render(draft.gaussians, camera, features=is_new)
     assert rendering.features is not None

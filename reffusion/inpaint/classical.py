@@ -58,7 +58,7 @@ def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: s
 
     Args:
         module: takes an image [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], which is 1 in the hole. The sides of both
-            are multiples of 8. It returns an image of the same size in [0, 1].
+            are multiples of 8. The module returns an image of the same size in [0, 1].
         image: uint8 [H, W, 3], of any size; it is padded.
         hole: bool [H, W], the pixels to fill.
         device: the device of the module.

@@ -23,7 +23,7 @@ def paint(command: str, image: np.ndarray, hole: np.ndarray, prompt: str, seed: 
     Args:
         command: the program and its arguments, see `params.inpainter.Inpainter`.
         image: uint8 [H, W, 3], as the program gets it.
-        hole: bool [H, W], the pixels to paint.
+        hole: bool [H, W], the pixels to paint, at least one.
         prompt, seed: the values of {prompt} and {seed}.
 
     Returns:
@@ -51,12 +51,12 @@ def paint(command: str, image: np.ndarray, hole: np.ndarray, prompt: str, seed: 
 
 
 def _fill(word: str, values: dict[str, str]) -> str:
-    """Return a word of the command with its placeholders replaced."""
+    """Return a word of the command with its placeholders {name} replaced; those without a value stay as they are."""
     return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[0]), word)
 
 
 def _run(words: list[str]) -> str:
-    """Run a program, and return the last line of its stderr as the end of an error message, "" if there is none."""
+    """Run a program, and return ": " and the last line of its stderr, "" without one; raise ValueError if it fails."""
     try:
         done = subprocess.run(words, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)
     except OSError as error:

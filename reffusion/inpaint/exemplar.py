@@ -191,7 +191,7 @@ def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray)
 def _source_image(
     view: DepthView, image: np.ndarray, around: Background, with_reflections: bool = False
 ) -> SourceImage:
-    """Convert a view to a source of texture, whose usable pixels show surfaces near the object."""
+    """Convert a view to a source of texture near the object, reflections on planes only if `with_reflections`."""
     depth = remove_reflected_depth(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.center, axis=-1) < SOURCE_REACH * around.radius

@@ -57,7 +57,8 @@ def load(
 
     Returns:
         Function (image uint8 [H, W, 3], hole bool [H, W], seed) -> uint8 [H, W, 3]. Pixels outside the hole are
-        unchanged. It raises ValueError if an output has another shape than published, or is not finite.
+        unchanged. The function raises ValueError if a network fails, or if an output has another shape than published
+        or is not finite.
 
     Raises:
         ValueError: onnxruntime is missing, or a file has other inputs than those published. The message is one line
@@ -82,7 +83,7 @@ def _sample(
     steps: int,
     guidance: float,
 ) -> np.ndarray:
-    """Paint a picture, uint8 [512, 512, 3], in its hole; the content of the hole is where the sampler starts."""
+    """Return the network's painting of a whole picture, uint8 [512, 512, 3]; it starts from the content of the hole."""
     image = torch.from_numpy(picture).permute(2, 0, 1)[None] / 127.5 - 1
     mask = torch.from_numpy(hole)[None, None].float()
     clean, known = (SCALING * run(MOEBIUS.encoder, image=each)[:, :4] for each in (image, image * (1 - mask)))

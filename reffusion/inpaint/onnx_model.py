@@ -21,9 +21,8 @@ class Network:
     Attributes:
         side: px, side of the square images that the network takes; None if it takes any size.
         paint: function (picture uint8 [H, W, 3], hole bool [H, W], True = to fill) -> uint8 [H, W, 3]. The result is
-            the network's output for the whole picture, also outside the hole. Raises ValueError if the
-            network fails on the picture, or if its output has another size, is not finite, or has values in [0, 1]
-            instead of 0..255.
+            the network's output for the whole picture, also outside the hole. Raises ValueError if the network fails on
+            the picture, or if its output has another size, is not finite, or has values in [0, 1] instead of 0..255.
     """
 
     side: int | None

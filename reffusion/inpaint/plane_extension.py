@@ -99,15 +99,15 @@ class _PlaneMap:
 
 @torch.no_grad()
 def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0) -> Gaussians:
-    """Return the Gaussians, float32 on the CPU, that continue the scene's planes beyond the training views.
+    """Return new Gaussians, float32 on the CPU, that continue the scene's planes beyond the training views.
 
     Args:
         gaussians: the scene.
-        cameras: the training views.
+        cameras: the training views, at least one.
         seed: seed of the search for planes and patches.
 
     Returns:
-        Thin disks of one color each, none if no plane reaches the border of the capture.
+        Thin disks of one color each, without the scene's Gaussians; none if no plane reaches the border of the capture.
     """
     extension = gaussians.map(lambda p: p[:0].float().cpu())
     views = [_render(gaussians, camera) for camera in cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))]]
@@ -138,7 +138,7 @@ def _render(gaussians: Gaussians, camera: Camera) -> _View:
 
 
 def _sample(views: Sequence[_View], seed: int) -> tuple[np.ndarray, float]:
-    """Return random points [S, 3] of the visible surfaces, and the median size of a pixel there, in world units."""
+    """Return random visible points [S, 3], S may be 0, and the median size of a pixel there, in world units."""
     generator = np.random.default_rng(seeding.seed_for(seed, "surfaces of the scene"))
     points, sizes = [np.zeros((0, 3))], [np.zeros(0)]
     for view in views:

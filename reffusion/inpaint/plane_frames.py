@@ -37,7 +37,7 @@ def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> 
 def plane_jacobians(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
     """Return [H, W, 2, 2], the derivative of a pixel's coordinates on its plane with respect to the pixel (x, y).
 
-    It is the identity for pixels on no plane.
+    The derivative is the identity for pixels on no plane.
 
     Args:
         label: int [H, W], the plane of each pixel, see `label_planes`.
@@ -60,7 +60,7 @@ def plane_jacobians(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) 
 def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
     """Return [H, W, 2], the coordinates of each pixel on its plane, along `Plane.axes` from `Plane.origin`.
 
-    They are in world units, and 0 for pixels on no plane.
+    The coordinates are in world units, and 0 for pixels on no plane.
 
     Args:
         label: int [H, W], the plane of each pixel, see `label_planes`.

@@ -26,7 +26,7 @@ def blend(
 
     Args:
         known: [H, W, 3], the picture outside the hole, which the hole must join without a seam.
-        hole: bool [H, W], the N pixels to compute.
+        hole: bool [H, W], the N pixels to compute, at least one.
         right, below: [H, W, 3], the desired difference from each pixel to the next one on the right, and below.
         own: [H, W, 3], the desired colors.
         beside: bool [H, W], the pixels outside the hole that the hole must join; None for all.
@@ -87,7 +87,7 @@ def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.
 
     Args:
         values: [H, W, 3].
-        hole: bool [H, W], the N pixels to fill.
+        hole: bool [H, W], the N pixels to fill, at least one.
         beside: bool [H, W], the pixels outside the hole whose values are continued into it.
 
     Returns:

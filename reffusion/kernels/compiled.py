@@ -27,7 +27,7 @@ import torch
 T = TypeVar("T")
 R = TypeVar("R")
 # Least size, in numbers, of an array whose memory is reused; and how many blocks of memory are kept, about as many as
-# two optimisation steps need.
+# two optimization steps need.
 _MIN_KEPT, _MAX_BLOCKS = 2**16, 24
 MIN_PARALLEL = 8000  # Gaussians below which another thread costs more time than it saves
 # Fast-math flags of LLVM. The order and rounding of operations may change, but NaN and infinity are preserved, because
@@ -54,8 +54,9 @@ def _cache_folder() -> Path:
 def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
     """Return `function` as a numba kernel that runs without the GIL.
 
-    It is compiled at the first call; later processes load the machine code from disk. Assigning an array to a slice of
-    another takes two seconds to compile, since numba compiles the error message, too; a loop does not.
+    The kernel is compiled at the first call; later processes load the machine code from disk. Machine code that other
+    versions of the sources left in the cache is deleted. Assigning an array to a slice of another takes two seconds to
+    compile, since numba compiles the error message, too; a loop does not.
 
     Args:
         function: the function to compile.
@@ -82,10 +83,10 @@ def inlined(function: Callable) -> Callable:
 
 
 def empty_aligned(*shape: int) -> np.ndarray:
-    """Return an uninitialised float32 array of this shape, aligned to cache lines.
+    """Return an uninitialized float32 array of this shape, aligned to cache lines.
 
     A large array takes the memory of an earlier array that no longer exists. Otherwise the system would provide new
-    pages of memory each time, and clearing these takes much of an optimisation step.
+    pages of memory each time, and clearing these takes much of an optimization step.
     """
     size = math.prod(shape)
     if size < _MIN_KEPT:
@@ -104,7 +105,7 @@ def empty_aligned(*shape: int) -> np.ndarray:
 
 
 def _cache_aligned(size: int) -> np.ndarray:
-    """Return an uninitialised float32 array [size] in new memory, aligned to cache lines of 64 bytes."""
+    """Return an uninitialized float32 array [size] in new memory, aligned to cache lines of 64 bytes."""
     memory = np.empty(size + 16, np.float32)
     first = -memory.ctypes.data // 4 % 16
     return memory[first : first + size]
@@ -132,7 +133,7 @@ def _blocks() -> tuple[list[_Block], threading.Lock]:
 def threads() -> int:
     """Return the number of threads for kernels: torch's number, so that one setting (or OMP_NUM_THREADS) controls both.
 
-    Inside `torch_on_one_thread`, where torch's number is 1, it is the number that torch had before.
+    Inside `torch_on_one_thread`, where torch's number is 1, the result is the number that torch had before.
     """
     return getattr(_torch_threads, "threads", None) or torch.get_num_threads()
 
@@ -141,7 +142,7 @@ def threads() -> int:
 def torch_on_one_thread() -> Iterator[None]:
     """Let torch use one thread, for work that mostly renders; a context manager, also usable as a decorator.
 
-    Torch's operations between kernels are small. In each of them, synchronising threads takes longer than the threads
+    Torch's operations between kernels are small. In each of them, synchronizing threads takes longer than the threads
     save, and far longer if another process occupies a core. Besides, results then do not depend on the number of
     threads. Kernels still use `threads()` threads.
     """
@@ -178,7 +179,7 @@ def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) 
 
 
 def views_at_once(device: str | torch.device) -> int:
-    """Return how many views to process `map_in_threads`: one on a GPU, which a single view occupies."""
+    """Return how many views `map_in_threads` should process at once: `MAX_VIEWS` on a CPU, one on any other device."""
     return MAX_VIEWS if torch.device(device).type == "cpu" else 1
 
 
@@ -186,10 +187,10 @@ def map_in_threads(function: Callable[[T], R], items: Iterable[T], most: int = 8
     """Yield `function(item)` for each item, in order; several items are computed at once, each in one thread.
 
     This is useful for functions whose array operations release the GIL. Torch's threads are divided among the items. If
-    the iteration ends early, items whose computation has not begun are cancelled.
+    the iteration ends early, items whose computation has not begun are canceled.
 
     Args:
-        most: largest number of items at once; it is also limited by `threads()`.
+        most: largest number of items at once, which `threads()` limits too.
     """
     workers = max(1, min(threads(), most))
     threads_each = max(1, threads() // workers)

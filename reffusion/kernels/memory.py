@@ -119,7 +119,7 @@ def load_mask(typing, array, place):
 
 @intrinsic
 def store_whole(typing, array, place, value):
-    """Write a float32 vector to LANES consecutive elements of an int32 array; fractions are cut off."""
+    """Write a float32 vector to LANES consecutive elements of an int32 array from `place` on; fractions are cut off."""
 
     def emit(context, builder, sig, args):
         at = _pointer(context, builder, (sig.args[0], args[0]), (sig.args[1], args[1]), INTS)
@@ -152,8 +152,8 @@ def _indices(places) -> ir.Constant:
 
 
 def _fold(builder, x, y, unit: int, span: int):
-    """Add neighbouring groups of lanes of two vectors, so that one vector holds the sums of both."""
-    # Within each `span` of lanes, every two neighbouring groups of `unit` lanes are added element by element. In the
+    """Add neighboring groups of lanes of two vectors, so that one vector holds the sums of both."""
+    # Within each `span` of lanes, every two neighboring groups of `unit` lanes are added element by element. In the
     # result the sums of x come first in each span, and the sums of y follow.
     even = [
         source + start + at
@@ -244,8 +244,8 @@ def load_columns(typing, array, width, column, row, last, columns, place):
 def store_columns(typing, array, width, column, row, columns, place):
     """Write LANES columns, stored one after the other in `columns` from `place` on, to a block of an array [R, width].
 
-    It is the inverse of `load_columns` without the limit `last`: the array must have all rows from `row` to `row` +
-    LANES - 1.
+    This is the inverse of `load_columns` without the limit `last`: the array, stored flat, must have all rows from
+    `row` to `row` + LANES - 1, and all columns from `column` to `column` + LANES - 1.
     """
 
     def emit(context, builder, sig, args):

@@ -1,8 +1,8 @@
 """Vectors of LANES numbers as values of numba kernels, a thin layer over LLVM vectors.
 
 A *lane* is one number of a vector. LANES is sixteen if the processor has AVX-512, else eight. The types are `lanes`
-(float32), `wide` (float64) and `lane_mask` (a bit per lane). LLVM vectorises a loop only if it finds this safe and
-worthwhile, which it does not for blending. With these operations a kernel is vectorised explicitly; the compiler turns
+(float32), `wide` (float64) and `lane_mask` (a bit per lane). LLVM vectorizes a loop only if it finds this safe and
+worthwhile, which it does not for blending. With these operations a kernel is vectorized explicitly; the compiler turns
 them into AVX-512, AVX2 or SSE instructions.
 
 Operators work lane by lane. If one side is a number, each lane uses this number. Comparisons return masks.
@@ -278,7 +278,7 @@ def times_power(typing, x, rounded):
 
 @intrinsic
 def exp2(typing, x):
-    """Return 2^x of a float64 vector in [-1022, 1023]; outside the result is undefined, without a trap."""
+    """Return 2^x of a float64 vector in [-1022, 1023]; outside this range the result is undefined, without a trap."""
 
     def emit(context, builder, sig, args):
         magic, value = _constant(DOUBLES, 1.5 * 2.0**52), _constant(DOUBLES, _EXP2_DOUBLE[-1])
@@ -294,7 +294,7 @@ def exp2(typing, x):
 
 @intrinsic
 def log2(typing, x):
-    """Return log2(x) of a float64 vector of positive normal numbers; elsewhere it is undefined, without a trap."""
+    """Return log2(x) of a float64 vector of positive normal numbers; for others it is undefined, without a trap."""
 
     def emit(context, builder, sig, args):
         number = lambda value: ir.Constant(LONGS, [int(np.float64(value).view(np.int64))] * LANES)

@@ -1,6 +1,6 @@
 """Classification of a scene: which Gaussians are the object, and the class of every pixel of every view.
 
-Raw masks vote on which Gaussians are the object. The labelled Gaussians are rendered into each view, which gives its
+Raw masks vote on which Gaussians are the object. The labeled Gaussians are rendered into each view, which gives its
 consistent mask C. Pixels of C whose background too few other photographs show are unobserved (U). Pixels to be
 invented are the invent mask I, see `reffusion.types.MaskSet`.
 """
@@ -37,7 +37,8 @@ class ObjectMarks:
         ignored: training view -> bool [H, W], pixels that cast no votes and show nothing.
         deleted: bool [N], Gaussians that a user deleted in a splat editor, which leave a hole: the object's labels
             instead of votes. None unless the scene brings edited Gaussians.
-        scattered: bool [N], deleted Gaussians that stood alone: they are removed, and leave no hole. None likewise.
+        scattered: bool [N], deleted Gaussians that stood alone: they are removed, and leave no hole. None unless the
+            scene brings edited Gaussians.
     """
 
     raw: Mapping[str, np.ndarray]
@@ -59,7 +60,7 @@ class Classification:
         background: the surfaces around the object.
         has_surfaces: whether planes and mirrors were searched, because the classes depend on them.
         shadow: the object's soft shadow; None if none is found.
-        remnants: the parts of the object that the masks leave out. Those that would float in the air are labelled.
+        remnants: the parts of the object that the masks leave out. Those that would float in the air are labeled.
         voting_views: number of views that voted.
         unobserved_share: share of the pixels of C that are unobserved, before negligible ones are dropped.
         warnings: sentences about deleted Gaussians.
@@ -168,6 +169,9 @@ def find_shadow(params: Params, background: Background, object_means: Tensor, sc
         background: with the photographs and the planes around the object.
         object_means: [N, 3], the centers of the object's Gaussians.
         scene: names the views that were photographed without the object, and so without its shadow.
+
+    Returns:
+        None if `params.shadows` is False, if the background has no planes, or if no shadow is found.
     """
     if not params.shadows or not background.planes:
         return None
@@ -180,10 +184,10 @@ def find_shadow(params: Params, background: Background, object_means: Tensor, sc
 
 
 def limit_extras(extras: Tensor, deleted: Tensor, where: str, warnings: list[str]) -> Tensor:
-    """Return the Gaussians to remove besides those that a user deleted in an editor, or none if they outnumber these.
+    """Return `extras`, or no Gaussians if the extras outnumber those that a user deleted in an editor.
 
-    An object may hide some Gaussians, which an editor does not show. If they outnumber the object's own, the hole is
-    probably no object's, and what the user left in the scene stays.
+    An object may hide some Gaussians, which an editor does not show. If the hidden Gaussians outnumber the object's
+    own, the hole is probably no object's, and what the user left in the scene stays.
 
     Args:
         extras: bool [N], True for Gaussians to remove that the user did not delete.

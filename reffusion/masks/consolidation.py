@@ -29,7 +29,7 @@ from reffusion.params.masks import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
-UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labelled by its position
+UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labeled by its position
 ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are removed, smaller holes filled
 
 
@@ -43,7 +43,7 @@ def label_object(
 ) -> Tensor:
     """Label the Gaussians of the object: by votes of the raw masks, or without masks by a region in space.
 
-    Gaussians that hardly any view sees are also labelled by their position: they belong to the object if they project
+    Gaussians that hardly any view sees are also labeled by their position: they belong to the object if they project
     into the masks of more than half of the views (`voting.hidden_inside`).
 
     Args:
@@ -58,6 +58,9 @@ def label_object(
     Returns:
         bool [N], True for the Gaussians of the object. All are False if there are neither masks nor a region that holds
         the object.
+
+    Raises:
+        ValueError: as `voting.cast_votes`.
     """
     if not ballots:
         if region is None or not region.holds:
@@ -68,7 +71,7 @@ def label_object(
     weights = cast(mode="weight")
     votes = weights if params.vote == "weight" else cast(mode=params.vote)
     labels = voting.label_gaussians(votes, params.tau)
-    # Gaussians that hardly any view sees, e.g. inside the object or in the wall behind the object, are labelled by
+    # Gaussians that hardly any view sees, e.g. inside the object or in the wall behind the object, are labeled by
     # their position. PAPER leaves open: the ratio of votes 0 / 0 of Gaussians that no view sees.
     unseen = _total(weights) <= (UNSEEN_WEIGHT if params.tidy else 0)
     return labels | (unseen & voting.hidden_inside(gaussians, cameras, ballots))
@@ -116,7 +119,7 @@ def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:
 def needs_unobserved(params: Params, fill: FillRequest) -> bool:
     """Return whether the pixel classes depend on what other photographs show.
 
-    They do not if all of C is invented (`params.invent` "consistent") and the scene asks to fill nothing else.
+    The result is False if all of C is invented (`params.invent` "consistent") and the scene asks to fill nothing else.
     """
     return params.invent != "consistent" or bool(fill)
 
@@ -180,7 +183,7 @@ def add_uncaptured_pixels(
         sets: view name -> pixel classes, as `classify_pixels` returns them.
 
     Returns:
-        View name -> extended pixel classes, of the camera-only views.
+        View name -> extended pixel classes, for the camera-only views only.
     """
     if not scene.camera_only:
         return {}
@@ -223,6 +226,7 @@ def count_pixels(kind: str, sets: Mapping[str, MaskSet], names: Sequence[str]) -
 def unobserved_share(sets: Mapping[str, MaskSet], names: Sequence[str]) -> float:
     """Return the share of the consistent masks' pixels that are unobserved, in [0, 1], over the views `names` together.
 
-    Behind an unobserved pixel too few photographs show it. The share is 0 if all consistent masks are empty.
+    A pixel is unobserved if too few other photographs show the background there. The share is 0 if all consistent masks
+    are empty.
     """
     return count_pixels("unobserved", sets, names) / max(count_pixels("consistent", sets, names), 1)

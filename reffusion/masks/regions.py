@@ -17,7 +17,7 @@ CLOSED = 0.008  # of the image's width: gaps up to twice as wide are closed
 
 @dataclass(frozen=True)
 class Region:
-    """An axis-aligned box in the normalised frame, or the ellipsoid inscribed in it.
+    """An axis-aligned box in the normalized frame, or the ellipsoid inscribed in it.
 
     Attributes:
         center: [3], the middle.

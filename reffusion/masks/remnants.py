@@ -24,13 +24,13 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-EXTENT = 4.0  # in radii of the object: a part farther from its middle touches Gaussians that are labelled by mistake
+EXTENT = 4.0  # in radii of the object: a part farther from its middle touches Gaussians that are labeled by mistake
 REACH = 1.0  # in radii of the object: Gaussians farther from the object than this belong to the surroundings
 # In radii of the object: distance up to which the surroundings are considered. The distance is increased until the
 # surroundings have `SAMPLES` Gaussians.
 SURROUNDINGS = 3.0
 ATTACHMENT = 2.0  # in the cut, contact with the object is divided by this
-LEAST_SIMILARITY = 0.3  # least similarity of two unlabelled Gaussians in the cut, so that a pattern divides no surface
+LEAST_SIMILARITY = 0.3  # least similarity of two unlabeled Gaussians in the cut, so that a pattern divides no surface
 COLOR_WEIGHT = 0.3  # weight of the log-ratio of color densities in the cut; in the score its weight is 1
 LARGEST_LOG_RATIO = 3.0  # limit of the absolute value of this log-ratio
 SAMPLES, NEAREST = 2000, 10  # density of a color: from the distance to the NEAREST-th of up to SAMPLES random colors
@@ -118,14 +118,14 @@ def _find_visible(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
 
 
 def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarray, bool]]:
-    """Find the connected parts of the unlabelled scene that seem to belong to the object, whatever their visible size.
+    """Find the connected parts of the unlabeled scene that seem to belong to the object, whatever their visible size.
 
     Args:
         gaussians: the N Gaussians of the whole scene.
         labels: bool [N], True for the Gaussians of the object.
 
     Returns:
-        For each part its Gaussians, bool [N], none of which is labelled, and whether the part would float once the
+        For each part its Gaussians, bool [N], none of which is labeled, and whether the part would float once the
         object is removed.
     """
     means = gaussians.means.detach().cpu().double().numpy()
@@ -216,7 +216,7 @@ def render_parts(gaussians: Gaussians, parts: Sequence[np.ndarray], camera: Came
     """Return for each part the pixels, bool [H, W], at which the blending weights of its Gaussians sum to above 0.5.
 
     Args:
-        parts: bool [N] for each part, True for its Gaussians.
+        parts: bool [N] for each part, True for its Gaussians; at least one part.
     """
     features = torch.as_tensor(np.stack(parts, -1)).to(gaussians.means)
     shares = rasterizer.render(gaussians, camera, sh_degree=0, features=features).features.cpu().numpy()

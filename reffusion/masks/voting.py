@@ -58,7 +58,7 @@ def cast_votes(
         ignored: view name -> bool [H, W], pixels that do not vote; a view without an entry has none.
 
     Raises:
-        ValueError: no view has a mask, or a mask does not have the size of its view.
+        ValueError: none of `cameras` has a mask, or a mask does not have the size of its view.
     """
     voters = [camera for camera in cameras if camera.name in masks]
     if not voters:
@@ -90,8 +90,8 @@ def find_floaters(
 ) -> Tensor:
     """Find floaters: Gaussians that contribute mostly to unobserved pixels once the object is removed.
 
-    Too few other photographs show the place behind an unobserved pixel. They hardly supervised the fit
-    there, so Gaussians may extend far into or behind the object. Floaters are found by the same vote as the object,
+    Too few other photographs show the place behind an unobserved pixel. Hardly anything supervised the fit there, so
+    Gaussians may extend far into or behind the object. Floaters are found by the same vote as the object,
     with the unobserved pixels as masks, and without the object's Gaussians.
 
     Args:
@@ -102,10 +102,10 @@ def find_floaters(
             exceeds this.
 
     Returns:
-        bool [M], True for floaters.
+        bool [M], True for floaters; all False if no pixel is unobserved.
 
     Raises:
-        ValueError: as `cast_votes`.
+        ValueError: as `cast_votes`, unless no pixel is unobserved.
     """
     if not any(mask.any() for mask in unobserved.values()):
         return torch.zeros(len(remaining), dtype=torch.bool, device=remaining.means.device)
@@ -117,9 +117,9 @@ def hidden_inside(
 ) -> Tensor:
     """Return bool [N], the Gaussians whose means project into the masks in more than `share` of the views.
 
-    All Gaussians are tested, whether views see them or not. This finds those inside the object, which votes by blending
-    weight cannot label if no view sees them. They would become visible once the object is removed. The arguments are
-    those of `points_inside`.
+    All Gaussians are tested, whether views see them or not. So Gaussians inside the object are found, which votes by
+    blending weight cannot label if no view sees them, and which would become visible once the object is removed. The
+    other arguments are those of `points_inside`.
     """
     means = gaussians.means.detach().cpu().double().numpy()
     return torch.as_tensor(points_inside(means, cameras, masks, share), device=gaussians.means.device)
@@ -149,14 +149,14 @@ def points_inside(
 
 @torch.no_grad()
 def render_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarray:
-    """Render labels into one view: [H, W] in [0, 1), the total blending weight of the labelled Gaussians at each pixel.
+    """Render labels into one view: [H, W] in [0, 1), the total blending weight of the labeled Gaussians at each pixel.
 
     The consistent mask C consists of the pixels where the result exceeds tau'. PAPER leaves open: whether the result is
-    divided by alpha first. Here it is not: where alpha is small, nothing hides the background, so faint labelled
+    divided by alpha first. Here it is not: where alpha is small, nothing hides the background, so faint labeled
     Gaussians should not mask the pixel.
 
     Args:
-        labels: bool [N], True for labelled Gaussians.
+        labels: bool [N], True for labeled Gaussians.
     """
     return render_with_labels(gaussians, labels, camera).features[..., 0].cpu().numpy()
 

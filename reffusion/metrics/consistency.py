@@ -91,8 +91,9 @@ def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarra
         mask: bool [H, W], True = the pixel was inpainted.
 
     Returns:
-        Depth [H, W]. It is 0 in the mask if the surroundings do not determine a continuation, and at pixels that would
-        be farther than ten times the farthest known depth. It is 0 everywhere if no depth is known outside the mask.
+        Depth [H, W], equal to `depth` outside the mask. It is 0 in the mask if the surroundings do not determine a
+        continuation, and at masked pixels that would be farther than ten times the farthest known depth. It is 0
+        everywhere if no depth is known outside the mask.
     """
     known = (depth > 0) & ~mask
     if not known.any():

@@ -23,7 +23,7 @@ MAX_UNSCORED = 64  # most training views that are rendered where there are no te
 def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
     """Return the names of the views to render, and their kind, e.g. "test", "training" or "training (one in 2)".
 
-    They are the test views. Without test views they are all training views, or every n-th one if there are more than
+    The views are the test views; without test views all training views, or every n-th one if there are more than
     `MAX_UNSCORED`.
     """
     if scene.test:
@@ -59,7 +59,7 @@ class ViewScorer:
         models: name -> LPIPS network.
         longest: larger side in px of the reduced pictures that are scored as well; 0 for none.
         segmenter: network that looks for leftovers of the object; None if it is not on this machine.
-        examined: views in which it looks for them.
+        examined: names of the views in which the network looks for leftovers.
     """
 
     models: Mapping[str, Any]
@@ -68,7 +68,7 @@ class ViewScorer:
     examined: Collection[str]
 
     def score(self, renders: ViewRenders, truth: rows.GroundTruth) -> dict[str, Any]:
-        """Return the row of per_view.csv for a view."""
+        """Return the row of per_view.csv for a view: `rows.score_row`, and leftovers if the view is examined."""
         result, fit = renders.result, renders.by_stage["fit"]
         row = rows.score_row(result, renders.by_stage.get("initialize"), truth, dict(self.models), self.longest)
         if self.segmenter and result.camera.name in self.examined and result.mask.any():
@@ -79,7 +79,9 @@ class ViewScorer:
 def score_in_order(
     evaluate_view: Callable[[str], tuple[RenderedView, dict[str, Any]]], names: Sequence[str], device: str
 ) -> list[dict[str, Any]]:
-    """Return the rows of all views, each with the consistency between the view and the one before it.
+    """Return the rows of all views, in their order, each with the consistency between the view and the next one.
+
+    The consistency of the last view is None. Progress is printed.
 
     Args:
         evaluate_view: returns the result of a view and its row; it is called for several views at once.

@@ -65,7 +65,7 @@ def _filter_contrast(picture: np.ndarray) -> np.ndarray:
 
 
 def _blur_channel(channel: np.ndarray, gaussians: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """Filter a channel [H, W] by a normalised sum of Gaussians, given by (weight, width in degrees^2)."""
+    """Filter a channel [H, W] by a normalized sum of Gaussians, given by (weight, width in degrees^2)."""
     parts = [(weight * sqrt(pi / width), _gaussian_kernel(width)) for weight, width in gaussians]
     total = sum(weight * kernel.sum() ** 2 for weight, kernel in parts)
     # Each Gaussian is separable into rows and columns.
@@ -74,7 +74,7 @@ def _blur_channel(channel: np.ndarray, gaussians: tuple[tuple[float, float], ...
 
 
 def _gaussian_kernel(width: float) -> np.ndarray:
-    """Sample the 1D kernel exp(-pi^2 x^2 / width) at pixels, x in degrees, width in degrees^2; it is not normalised."""
+    """Sample the 1D kernel exp(-pi^2 x^2 / width) at pixels, x in degrees, width in degrees^2; it is not normalized."""
     widest = max(each for channel in SENSITIVITY for _, each in channel)
     # Three standard deviations of the widest Gaussian in `SENSITIVITY`.
     radius = ceil(3 * sqrt(widest / (2 * pi**2)) * PIXELS_PER_DEGREE)

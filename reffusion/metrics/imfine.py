@@ -31,7 +31,8 @@ PROTOCOL = (
 def score_view(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips]) -> dict[str, float]:
     """Return the scores of a view: name of `COLUMNS` with `PREFIX` -> value.
 
-    A score that the box is too small for, or whose network is missing, is left out; so are all if the mask is empty.
+    A score that the box is too small for, or whose network is missing, is left out. The result is {} if the mask is
+    empty.
 
     Args:
         image, truth: uint8 [H, W, 3].
@@ -53,7 +54,7 @@ def score_view(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, models: d
 
 
 def largest_contour_box(mask: np.ndarray) -> Box | None:
-    """Return the bounding box of the contour with the largest area in a mask, uint8 [H, W]; None if it is empty."""
+    """Return the box of the contour with the largest area in a mask, uint8 [H, W]; None if all pixels are 0."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if not contours:
         return None

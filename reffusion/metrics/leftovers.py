@@ -40,7 +40,7 @@ def find_leftovers(segmenter: Segmenter, before: np.ndarray, after: np.ndarray, 
     Args:
         segmenter: the network, which is asked about `after`.
         before, after: uint8 [H, W, 3], the rendered view with the object and after its removal.
-        mask: bool [H, W], the object.
+        mask: bool [H, W], the object; other pixels are False in the result.
     """
     same = mask & (cv2.absdiff(before, after).max(-1) <= SAME)
     found, left, features = np.zeros_like(mask), open_mask(same, WIDTH), None
@@ -62,5 +62,5 @@ def find_leftovers(segmenter: Segmenter, before: np.ndarray, after: np.ndarray, 
 
 
 def measure_share(segmenter: Segmenter, before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
-    """Return the share of the mask's pixels, at least one, that `find_leftovers` finds; the arguments are the same."""
+    """Return the share in [0, 1] of a non-empty mask that `find_leftovers` finds; the arguments are the same."""
     return float(find_leftovers(segmenter, before, after, mask)[mask].mean())

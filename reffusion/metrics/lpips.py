@@ -72,7 +72,7 @@ class Lpips(nn.Module):
         """Return the LPIPS distance [B] of two batches of images, [B, 3, H, W] in [-1, 1].
 
         This is the sum over layers l of the mean over the cells (pixels of the layer) of
-        w_l · (f_l(first) - f_l(second))², with features f_l normalised over channels.
+        w_l · (f_l(first) - f_l(second))², with features f_l normalized over channels.
 
         Raises:
             ValueError: the shapes differ, or a side of the images is smaller than `SMALLEST[net]`.
@@ -105,7 +105,7 @@ class Lpips(nn.Module):
         return sum(nn.functional.interpolate(each, size, mode="bilinear", align_corners=False) for each in layers)[:, 0]
 
     def activations(self, images: Tensor) -> list[Tensor]:
-        """Return the activations of the five compared layers, normalised over channels in each cell.
+        """Return the activations of the five compared layers, normalized over channels in each cell.
 
         Args:
             images: [B, 3, H, W] in [-1, 1].

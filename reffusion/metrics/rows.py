@@ -94,7 +94,7 @@ def _score_reduced(
 def summarize(
     rows: list[dict[str, Any]], columns: tuple[str, ...] = image_metrics.COLUMNS, infix: str = ""
 ) -> dict[str, Any]:
-    """Summarise columns over all views.
+    """Summarize columns over all views.
 
     Args:
         rows: the rows of `score_row`.
@@ -115,9 +115,9 @@ def summarize(
 
 
 def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
-    """Summarise the scores of the box at reduced size: `summarize` of `image_metrics.BOX_COLUMNS`, and "protocol".
+    """Summarize the scores of the box at reduced size: `summarize` of `image_metrics.BOX_COLUMNS`, and "protocol".
 
-    None if no view was reduced.
+    The result is None if no view was reduced.
 
     Args:
         longest: px, the larger side after the reduction, for the text of the protocol.
@@ -132,7 +132,7 @@ def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any
 
 
 def summarize_imfine(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Summarise the scores by the protocol of `imfine`: "mean", "views" and "protocol", as in `summarize`."""
+    """Summarize the scores by the protocol of `imfine`: "mean", "views" and "protocol", as in `summarize`."""
     values = {name: [row.get(imfine.PREFIX + name) for row in rows] for name in imfine.COLUMNS}
     return {
         "mean": {name: image_metrics.mean(each) for name, each in values.items()},
@@ -142,7 +142,7 @@ def summarize_imfine(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def summarize_leftovers(rows: list[dict[str, Any]], unavailable: str | None) -> dict[str, Any]:
-    """Summarise how much of the removed object is still found in the views.
+    """Summarize how much of the removed object is still found in the views.
 
     Args:
         unavailable: why the network cannot be used; None if it can.
@@ -171,16 +171,16 @@ def to_csv(rows: list[dict[str, Any]]) -> str:
 
 
 def add_consistency(row: dict[str, Any], view: RenderedView, following: RenderedView) -> None:
-    """Compare a view with the next view, and write the result into `CONSISTENCY_COLUMNS` of the view's row."""
+    """Compare a view with the next view, and write the result into `CONSISTENCY_COLUMNS` of `row`, the first view's."""
     row |= dict(zip(CONSISTENCY_COLUMNS, consistency.reprojected_color_difference(view, following), strict=True))
 
 
 def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Summarise the multi-view consistency over the pairs of consecutive views.
+    """Summarize the multi-view consistency over the pairs of consecutive views.
 
     Returns:
         "consistency", the color difference (0 = consistent), and "consistency_share", the share of the mask's pixels
-        that were compared: means over the pairs that have a value. "pairs": number of pairs that
+        that were compared: means over the pairs that have a value, None if none has. "pairs": number of pairs that
         could be compared. "protocol": description of the measurement.
     """
     difference, share = ([row[name] for row in rows] for name in CONSISTENCY_COLUMNS)

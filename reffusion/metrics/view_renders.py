@@ -70,7 +70,7 @@ class ViewRenderer:
         return ViewRenders(by_stage, RenderedView(camera, picture, depth, mask, matrix))
 
     def _view_exposure(self, camera: Camera, mask: np.ndarray, photo: np.ndarray | None) -> np.ndarray | None:
-        """Return the view's affine color map [3, 4], adjusted to the photograph outside the mask if there is one."""
+        """Return the view's affine color map [3, 4], adjusted to a given photograph; None without an entry."""
         # None without an entry in `exposures`; see `exposure.PROTOCOL`.
         matrix = self.exposures.get(camera.name)
         if matrix is None or photo is None:

@@ -19,8 +19,8 @@ from reffusion.seeding import generator as seeded
 def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
     """Draw stratified timesteps in random order, long [count]: one in each of `count` equal parts of [0, steps).
 
-    All have the same random position within their part. Stratified timesteps vary less between batches than independent
-    ones.
+    All timesteps have the same random position within their part. Stratified timesteps vary less between batches than
+    independent ones.
 
     Args:
         count: Number of timesteps to draw, the size of a batch.

@@ -80,10 +80,10 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
 
 
 def measure_levels(prior: Prior, images: Tensor, masks: Tensor) -> levels.Levels:
-    """Measure the levels by which pictures are normalised before `encode` and `conditioning`.
+    """Measure the levels by which pictures are normalized before `encode` and `conditioning`.
 
     Args:
-        prior: The diffusion prior. Without `contrast` normalisation changes nothing.
+        prior: The diffusion prior. Without `contrast` normalization changes nothing.
         images: [B, 3, H, W] in [-1, 1].
         masks: [B, 1, H, W], 1 = repaint.
     """

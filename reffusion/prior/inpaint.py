@@ -144,7 +144,7 @@ def paint_coarse_to_fine(
     Args:
         sample: Function (pictures [count, 3, size, size] in [-1, 1], mask [1, 1, size, size] (1 = repaint), corner of
             the window: top, left; none for the whole view; start=initial noise level, level=number of the level or
-            "whole") -> new pictures of the same shape. The caller restores known pixels.
+            "whole") -> new pictures of the same shape. Their known pixels are not used.
         size: Side in pixels of the sampler's pictures.
         image: [3, H, W] float32 in [-1, 1]. Pixels inside the hole are ignored.
         hole: bool [H, W], with at least one True pixel, on the device of the image.

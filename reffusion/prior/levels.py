@@ -1,7 +1,7 @@
 """Levels: the brightness and contrast of a picture, as its known pixels have them.
 
 A small model makes errors of a fixed size, which stand out in a picture of low contrast, such as a window of a smooth
-wall. So pictures are normalised to the same mean and contrast before such a model sees them, and its outputs are
+wall. So pictures are normalized to the same mean and contrast before such a model sees them, and its outputs are
 converted back.
 """
 
@@ -39,7 +39,8 @@ class Levels(NamedTuple):
 def measure_levels(images: Tensor, hidden: Tensor, contrast: float) -> Levels:
     """Return the levels at which the known pixels have mean 0 and the standard deviation `contrast`.
 
-    Without known pixels, and with a contrast of 0, the levels are those of the picture itself.
+    The gain is limited: if the standard deviation is below `LEAST_CONTRAST`, the result stays below `contrast`. Without
+    known pixels, and with a contrast of 0, the levels change nothing (mean 0, gain 1).
 
     Args:
         images: [B, 3, H, W] in [-1, 1]. Values in the hole are ignored and need not be finite.

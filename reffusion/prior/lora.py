@@ -35,7 +35,7 @@ CONVOLUTIONS = (
 def attach(
     prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int
 ) -> dict[str, list[nn.Parameter]]:
-    """Attach new LoRA layers to UNet and text encoder, for SDXL to both text encoders, in place.
+    """Attach new LoRA layers to UNet and text encoder, for SDXL to both text encoders, in place, with dropout off.
 
     Args:
         prior: The diffusion prior.
@@ -188,7 +188,9 @@ def _adapter_config(part: nn.Module) -> dict[str, Any]:
 
 
 def merge(prior: Prior, folder: Path) -> Prior:
-    """Return the prior with the LoRA in `folder`. It shares the given prior's networks, which are changed in place.
+    """Return the prior with the LoRA in `folder`.
+
+    The result shares the networks of the given prior, which are changed in place.
 
     The LoRA is merged into the weights of the UNet. The text encoders keep separate LoRA layers.
 

@@ -8,7 +8,7 @@ read from the configuration, so that the embedded prior and SD2-inpainting take 
 Half precision applies to UNet and text encoders. Always float32 are:
 - the VAE: SDXL's overflows in float16, a gradient through the encoder underflows in float16, and the 8 bits of bfloat16
 show as bands in a decoded picture;
-- schedule, noise and x0 (reffusion.prior.diffusion); LoRA and its optimiser (reffusion.prior.lora); the sums of a
+- schedule, noise and x0 (reffusion.prior.diffusion); LoRA and its optimizer (reffusion.prior.lora); the sums of a
 softmax, within PyTorch's attention kernels.
 """
 
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from reffusion.weights import local
 
 # File in a model folder, {"hole": one of HOLES, "contrast": number}: content of the hole in the masked image, and the
-# contrast to which pictures are normalised (`Prior.contrast`).
+# contrast to which pictures are normalized (`Prior.contrast`).
 CONDITIONING = "conditioning.json"
 HOLES = ("grey", "harmonic")
 
@@ -71,6 +71,7 @@ class Prior:
 
     @property
     def device(self) -> torch.device:
+        """Return the device of the networks."""
         return self.alphas_cumprod.device  # a network's own `device` searches all modules: 9 ms
 
     @property
@@ -171,7 +172,17 @@ def find_folder(source: str | Path) -> Path:
 
 
 def load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
-    """Load a network with all of its weights; raises ValueError if weights are missing or do not fit config.json."""
+    """Load a network with all of its weights, and print no messages of its library.
+
+    Args:
+        kind: the class of the network, of diffusers or transformers.
+        folder: the folder of the model.
+        part: the network's folder in it, such as "unet".
+        dtype: type of the weights, as the keyword argument that `kind` takes: `torch_dtype` or `dtype`.
+
+    Raises:
+        ValueError: weights are missing or do not fit config.json.
+    """
     from transformers.utils import logging as transformers_logging
 
     transformers_logging.disable_progress_bar()

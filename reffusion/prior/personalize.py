@@ -54,7 +54,8 @@ def personalize(
 ) -> None:
     """Train the prior's LoRA in place, from the start or from the checkpoint in `folder`.
 
-    On the CPU a resumed training equals an unbroken one bit for bit.
+    The training ends early if the error "clean_latent_mse" falls by less than the share `settings.least_gain` while the
+    number of steps doubles; 0 rules this out. On the CPU a resumed training equals an unbroken one bit for bit.
 
     Args:
         prior: The prior with LoRA layers attached.
@@ -129,9 +130,10 @@ def _check_size(prior: Prior, size: int) -> None:
 def train_step(
     prior: Prior, optimizer: torch.optim.Optimizer, references: Sequence[Picture], settings: Params, step: int
 ) -> float:
-    """Take one optimiser step, and return the mean loss of the batch before it.
+    """Take one optimizer step, and return the mean loss of the batch before this step.
 
-    Random draws depend only on the seed and on `step`.
+    Random draws depend only on `settings.seed` and on `step`. LoRA dropout stays on, and torch's global generator is
+    seeded.
 
     Args:
         prior: The prior with LoRA layers attached.

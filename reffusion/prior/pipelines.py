@@ -47,7 +47,8 @@ def load_painter(
 
     Returns:
         Function (image uint8 [H, W, 3], hole bool [H, W], seed) -> uint8 [H, W, 3]. Pixels outside the hole are
-        unchanged. It raises ValueError if the pipeline fails, or if its pictures have another size or are not finite.
+        unchanged. The function raises ValueError if the pipeline fails, or if its pictures have another size or are not
+        finite.
 
     Raises:
         ValueError: weights are missing or damaged or do not fit, or diffusers cannot inpaint with this pipeline. The
@@ -99,7 +100,7 @@ def load_pipeline(source: str, dtype: torch.dtype, device: str) -> Any:
 
 
 def _find_loader(folder: Path, name: str) -> Callable[..., Any]:
-    """Return the function that loads a pipeline for inpainting, given the class that its model_index.json names."""
+    """Return the loader of pipeline class `name` for inpainting; raises ValueError if diffusers lacks this class."""
     try:
         kind = library_class(name)
     except AttributeError:
@@ -112,7 +113,7 @@ def _find_loader(folder: Path, name: str) -> Callable[..., Any]:
 
 
 def _load_parts(folder: Path, index: dict[str, Any], dtype: torch.dtype) -> dict[str, Any]:
-    """Load the networks of a pipeline with all of their weights; part -> network, None for parts that are left out."""
+    """Load a pipeline's networks: part -> network, None for parts left out; raises ValueError for code of the model."""
     parts = local.pipeline_parts(index)
     loaded = {part: None for part, value in index.items() if isinstance(value, list) and part not in parts}
     for part, (library, name) in parts.items():
@@ -144,7 +145,7 @@ def native_size(pipe: Any) -> int:
 
 
 def _run(pipe: Any, pictures: Tensor, mask: Tensor, options: dict[str, Any]) -> Tensor:
-    """Paint one picture [1, 3, n, n] in [-1, 1] where the mask [1, 1, n, n] is 1; returns [1, 3, n, n]."""
+    """Return a picture [1, 3, n, n] in [-1, 1], painted where the mask [1, 1, n, n] is 1; ValueError if this fails."""
     name, size = type(pipe).__name__, pictures.shape[-1]
     image = Image.fromarray(to_picture(pictures[0]))
     hole = Image.fromarray((mask[0, 0] > 0).numpy().astype(np.uint8) * 255)

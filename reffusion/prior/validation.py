@@ -102,7 +102,7 @@ def measure_errors(prior: Prior, held: HeldOut, prompts: list[str], seed: int) -
 
 @torch.no_grad()
 def _hole_errors(prior: Prior, held_out: HeldOut, text: Tensor, seed: int, level: float) -> Tensor:
-    """Return both errors of `denoising_error` in the hole of the reference at one noise level, [2, 2]."""
+    """Return the errors of `denoising_error` in the reference's hole at a noise level, [2 errors, view and crop]."""
     samples = held_out.reference
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     generator = seeded(seed, "personalize", "held out", level)

@@ -38,7 +38,7 @@ def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[
     object's Gaussians would be), and is never dropped, because it still teaches the prior.
 
     Args:
-        files: the references that come with the scene.
+        files: the references that come with the scene, at least one.
         space: results of earlier stages.
 
     Returns:
@@ -80,7 +80,7 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     Returns:
         The reference in the scene's common exposure, and a description of how well it fits its photograph. The
         reference's mask holds those pixels of `masks.invent` that the picture covers and that are in `masks.consistent`
-        or differ from the photograph. The depth, if any, is multiplied by the scale of the normalised frame.
+        or differ from the photograph. The depth, if any, is multiplied by the scale of the normalized frame.
 
     Raises:
         BadInput: the picture does not show its view, or shows another view better, and scene.yaml does not say that it
@@ -118,7 +118,7 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     differs = masks.consistent | changes.changed_pixels(image, photo, masks.invent, usual)
     image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
     depth = undistort_reference_depth(file, lens, found.affine)
-    if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalised frame
+    if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalized frame
         depth = depth * space.scene.similarity.scale
     return Reference(camera, image, masks.invent & inside & differs, depth), str(found)
 
@@ -157,8 +157,8 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
 def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
     """Raise ValueError if two references contradict each other.
 
-    They do so if their colors differ in the part of the hole that both show (`references.agreement`). Training would
-    average the two.
+    Two references contradict each other if their colors differ in the part of the hole that both show
+    (`references.agreement`). Training would average the two.
     """
     if len(references) < 2:
         return
@@ -188,8 +188,8 @@ def object_pixels(masks: MaskSet) -> np.ndarray:
 def view_distance(a: Camera, b: Camera) -> float:
     """Return a measure of how differently two cameras see the scene.
 
-    It is the distance of their centers, in units of the normalised frame, plus the angle between their optical axes, in
-    radians.
+    This is the distance of their centers, in units of the normalized frame, plus the angle between their optical axes,
+    in radians.
     """
     cosine = a.world_to_camera[2, :3] @ b.world_to_camera[2, :3]
     return float(np.linalg.norm(a.center - b.center) + np.arccos(np.clip(cosine, -1, 1)))

@@ -30,7 +30,7 @@ ALIKE = 0.7  # smallest cosine between the normals of the same surface in two vi
 LEAST_PIXELS = 40  # pixels, at the size `view_ranking.SIDE`, that both views must show for a pair to be compared
 # Mean difference, colors in [0, 1], from which two pictures contradict each other. On demo-pair true pictures have
 # 0.001, one 0.9 times as bright 0.004, one with a smoothly inpainted hole 0.007, one turned upside down 0.021; one 0.7
-# times as bright 0.038, with red and blue exchanged 0.047, mirrored 0.053, with the objects left in 0.089. A chequered
+# times as bright 0.038, with red and blue exchanged 0.047, mirrored 0.053, with the objects left in 0.089. A checkered
 # box on a real rock: up to 0.03.
 CONTRADICTION = 0.04
 
@@ -117,7 +117,7 @@ def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> 
 
 
 def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:
-    """Return how far the colors of `a` lie outside the range of those of `b`; see `color_difference`."""
+    """Return how far the colors of `a` lie outside the range of those of `b`, None as `color_difference`."""
     own = hole_a.pixels & (hole_a.depth > 0)
     points, colors = geometry.unproject(hole_a.depth, hole_a.camera)[own], _smooth_colors(a, hole_a)[own]
     uv, z = geometry.project(points, hole_b.camera)

@@ -23,8 +23,8 @@ def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> t
         known: bool [H, W], the pixels to compare.
 
     Returns:
-        Gain and offset, [3] each. They are 1 and 0 if they would hardly change any color, or if a gain is not within
-        `LEAST_GAIN` and `MOST_GAIN`.
+        Gain and offset, [3] each. All are 1 and 0 if the fit would hardly change any color, if a gain is not within
+        `LEAST_GAIN` and `MOST_GAIN`, or if fewer than `LEAST_PIXELS` pixels are known.
     """
     x, y = (_samples(image, known) for image in (picture, photo))
     gain, offset = np.ones(3), np.zeros(3)
@@ -74,7 +74,7 @@ def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Fit y = gain * x + offset by iteratively reweighted least squares; return the gain and the offset."""
+    """Fit y = gain * x + offset robustly, and return gain and offset: 1 and 0 for fewer than `LEAST_PIXELS` values."""
     if len(x) < LEAST_PIXELS:
         return 1.0, 0.0
     gain, offset = 1.0, float(np.median(y - x))

@@ -51,7 +51,7 @@ class Candidates:
         choose: int | None,
         facts: dict[str, Any],
     ) -> Candidates:
-        """Choose the candidate with the lowest score, unless `choose` is the number of another one."""
+        """Choose the candidate with the lowest score; if `choose` is not None, the one whose number is `choose`."""
         index = int(np.argmin(scores)) if choose is None else list(numbers).index(choose)
         return cls(images, numbers[index], images[index], facts)
 
@@ -66,7 +66,7 @@ def complete_best_view(params: Params, space: Workspace, folder: Path) -> tuple[
     Args:
         params: parameters of the stage `reference`.
         space: results of the stages `poses`, `fit` and `masks`.
-        folder: folder of candidates that take minutes. Those that it holds are not painted again.
+        folder: folder of candidates that take minutes. Candidates in it are not painted again.
 
     Returns:
         The reference, whose mask is I, and all candidates.
@@ -128,7 +128,7 @@ def _paint_by_prior(params: Params, base: np.ndarray, invent: np.ndarray) -> Can
 
 
 def _paint_by_seeds(params: Params, base: np.ndarray, masks: MaskSet, folder: Path) -> Candidates:
-    """Fill the hole by Moebius, a pipeline or a program, once per seed; each candidate is saved when it is done."""
+    """Fill the hole by Moebius, a pipeline or a program, once per seed; candidates that `folder` holds are kept."""
     hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
     numbers = params.candidate_numbers
     files = [folder / f"{number}.png" for number in numbers]
@@ -151,7 +151,11 @@ def _paint_once(painter: Painter, base: np.ndarray, masks: MaskSet) -> Candidate
 
 
 def load_seed_painter(params: Params) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:
-    """Return the function by which Moebius, a pipeline or a program paints: (image, hole, seed) -> image."""
+    """Return the function by which Moebius, a pipeline or a program paints: (image, hole, seed) -> image.
+
+    Raises:
+        ValueError: the weights are missing, damaged or of another kind.
+    """
     asked = params.inpainter
     if asked.kind == "moebius":
         return moebius.load(painters.find_moebius(asked), asked.steps, asked.guidance_scale)

@@ -61,8 +61,8 @@ def list_paintings(folder: Path) -> list[Path]:
 def obeys_orientation(path: Path, of_size: tuple[int, int]) -> bool:
     """Return whether the EXIF orientation tag of a reference is obeyed.
 
-    It is, unless the picture has the proportions of its view only without it: an editor may keep the tag of a
-    photograph whose tag is ignored because its pose refers to the stored pixels.
+    The tag is ignored only if the picture has the proportions of its view without the tag, but not with it: an editor
+    may keep the tag of a photograph whose tag is ignored because its pose refers to the stored pixels.
 
     Args:
         path: file of the picture.

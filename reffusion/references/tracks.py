@@ -72,7 +72,7 @@ def estimate_affine(source: np.ndarray, target: np.ndarray, inlier: float) -> np
 def low_pass(gray: np.ndarray) -> np.ndarray:
     """Return the picture, float32 [H, W], blurred by a Gaussian.
 
-    Its standard deviation is `LOW_PASS` times the longer side of the picture, at least `LEAST_LOW_PASS` px.
+    The standard deviation is `LOW_PASS` times the longer side of the picture, at least `LEAST_LOW_PASS` px.
     """
     sigma = max(LOW_PASS * max(gray.shape), LEAST_LOW_PASS)
     return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma)

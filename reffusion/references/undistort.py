@@ -32,6 +32,9 @@ def undistort_reference(
     Returns:
         The picture, uint8 [H, W, 3] of the size of `lens`, and bool [H, W], the pixels that the file covers: where it
         is rather opaque and, with `affine`, not beyond its border.
+
+    Raises:
+        BadInput: the file is missing or truncated, or is no picture.
     """
     upright = obeys_orientation(given.path, (lens.width, lens.height))
     image, inside = _resample(load_image(given.path, upright), given, lens, affine)

@@ -96,6 +96,9 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
         view_holes: view name -> its hole.
         chosen: the views that have been painted already.
         most: the largest number of other views.
+
+    Returns:
+        The ranking, the first view first; empty if no hole has a known depth.
     """
     covers, total = _coverage(view_holes)
     if not total:

@@ -35,11 +35,12 @@ def remove_shadows(
     """Detect the object's cast shadow by comparing references with their photographs, and relight all photographs.
 
     Of a reference that also fills pixels outside C (the object's mask), only the differences inside C count as shadow:
-    it shows an inserted object, which differs from the photograph, too.
+    such a reference shows an inserted object, which differs from the photograph, too. A line is printed for each
+    reference that shows a shadow.
 
     Args:
         references: completed views, without the object and its shadow.
-        gaussians: of the filled scene.
+        gaussians: the Gaussians of the filled scene.
         background: the photographs and where they show the object.
 
     Returns:
@@ -88,7 +89,7 @@ def detect_shadow(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> 
         mask: bool [H, W], C, True at pixels that show the object.
 
     Returns:
-        bool [H, W], the shadow with its soft rim; it may extend into the mask.
+        bool [H, W], the shadow with its soft rim, which may extend into the mask; all False without a shadow.
     """
     sigma = morphology.to_pixels(BLUR, mask.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32).mean(2), (0, 0), sigma)

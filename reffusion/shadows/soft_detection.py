@@ -60,7 +60,7 @@ def find_soft_shadow(background: Background, object_means: Tensor) -> SoftShadow
         object_means: [N, 3], the centers of the object's Gaussians.
 
     Returns:
-        The shadow whose log light sums to the lowest value. None if there is none, or if there are fewer than
+        The shadow whose log light sums to the lowest value. None if no shadow is found, or if there are fewer than
         `MIN_VIEWS` photographs.
     """
     if len(background.photos) < MIN_VIEWS:
@@ -118,8 +118,8 @@ def _map_coordinates(points: np.ndarray, background: Background, plane: Plane) -
 
 
 def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, clip: float) -> np.ndarray:
-    """Return [CELLS, CELLS, 3], the smooth log light of each channel; 0 where unseen."""
-    # The light L minimises sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
+    """Return [CELLS, CELLS, 3], the smooth log light of each channel, 0 where unseen; settings: `STIFF` or `SOFT`."""
+    # The light L minimizes sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
     # difference of neighboring cells and d2 the second difference. The weights a keep L at 0 far from the object.
     light = np.zeros((CELLS, CELLS, 3))
     number = np.where(seen, np.cumsum(seen).reshape(seen.shape) - 1, -1)
@@ -158,7 +158,7 @@ def _difference(number: np.ndarray, stencil: list[list[float]] | np.ndarray) -> 
 
 
 def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
-    """Return the dark cells, bool [CELLS, CELLS], of the object's shadow in the stiff light; None if there is none."""
+    """Return the dark cells, bool [CELLS, CELLS], of the object's shadow in a map of light; None without a shadow."""
     mean = light.mean(2)
     parts, count = ndimage.label(mean < -DARK)
     if not count:

@@ -57,8 +57,8 @@ class SoftShadow:
 
         Args:
             photo: uint8 [H, W, 3].
-            camera: its view.
-            depth: [H, W], camera z of what it shows; 0 where unknown. There the photograph stays the same.
+            camera: the view of the photograph.
+            depth: [H, W], camera z of what the photograph shows; 0 where unknown, and there the photograph stays.
         """
         known = depth > 0
         light = np.zeros((*depth.shape, 3))
@@ -80,7 +80,7 @@ class SoftShadow:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
-        """Return the shadow that `to_arrays` stored among `arrays`; None if there is none."""
+        """Return the shadow that `to_arrays` stored among `arrays`; None if `arrays` holds no shadow."""
         if "shadow_normal" not in arrays:
             return None
         values: dict[str, Any] = {each.name: arrays[f"shadow_{each.name}"] for each in fields(cls)}

@@ -70,13 +70,13 @@ class Agreement:
 
     @property
     def summary(self) -> str:
-        """One line for the log: what the poses as they are explain."""
+        """One line for the log: how many pairs the given poses explain, or that too few pairs match to judge them."""
         if self.pairs < LEAST_PAIRS:
             return f"poses not checked: only {self.pairs} pairs of photographs match"
         return f"poses as given explain {self.given} of {self.pairs} pairs of photographs that match"
 
     def describe(self, source: Path | None) -> str:
-        """Return the warning that tells the correction. `source`: the file of the poses."""
+        """Return the warning that tells the correction, which must not be None. `source`: the file of the poses."""
         assert self.correction is not None
         return (
             f"{source}: {self.correction.cause}. Corrected: of {self.placed} pairs of matching photographs, the poses "
@@ -86,6 +86,11 @@ class Agreement:
 
 def judge_poses(capture: Capture) -> Agreement:
     """Decide whether the poses of a capture belong to its photographs, and find the correction if they do not.
+
+    The result has no correction if fewer than `LEAST_PAIRS` pairs of photographs match.
+
+    Args:
+        capture: a capture with poses.
 
     Raises:
         BadInput: the poses contradict the photographs, and no correction makes them agree.
@@ -173,7 +178,7 @@ class _Pair:
 
 
 def _match_views(views: Mapping[str, _View]) -> Iterator[_Pair]:
-    """Yield pairs of views with the matches that one fundamental matrix explains, if it explains enough of them."""
+    """Yield the pairs of views that match well, with those matches that one fundamental matrix explains."""
     pairs = list(itertools.combinations(views, 2))
     matches = {pair: _mutual_matches(*(views[name].descriptors for name in pair)) for pair in pairs}
     likely = [pair for pair in pairs if len(matches[pair][0]) >= LEAST_MATCHES]
@@ -194,7 +199,7 @@ def _match_views(views: Mapping[str, _View]) -> Iterator[_Pair]:
 
 
 def _mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match descriptors [F, 128] and [G, 128]. Returns the indices int [K] of each: mutual best, clearly the best."""
+    """Return int [K] each: indices of descriptors [F, 128] and [G, 128] that match each other by far the best."""
     if min(len(one), len(other)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     similarity = one @ other.T
@@ -211,7 +216,7 @@ def _mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _explain(pairs: Sequence[_Pair], views: Mapping[str, _View], poses: Mapping[str, np.ndarray]) -> list[bool]:
-    """Return for each pair with enough parallax whether the world-to-camera poses explain it (`EXPLAINED`)."""
+    """Return whether world-to-camera poses explain each pair; a pair without parallax, or a pose, has no entry."""
     found = []
     for pair in pairs:
         if all(name in poses for name in pair.names):
@@ -276,7 +281,7 @@ def _each(poses: Mapping[str, np.ndarray], change: Callable[[np.ndarray], np.nda
 
 
 def _transpose_rotation(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return a world-to-camera pose [4, 4] whose rotation is transposed between `axes`, at the same camera center."""
+    """Return a world-to-camera pose [4, 4] with its rotation R replaced by axes R^T axes, at the same camera center."""
     center = -pose[:3, :3].T @ pose[:3, 3]
     result = np.eye(4)
     result[:3, :3] = axes[:3, :3] @ pose[:3, :3].T @ axes[:3, :3]
@@ -297,7 +302,7 @@ def _axes() -> list[tuple[str, np.ndarray]]:
 
 
 def _name_axes(order: Sequence[int], signs: Sequence[float], matrix: np.ndarray) -> str:
-    """Return what rotated camera axes are called in a message."""
+    """Return the name, for a message, of the camera axes that `matrix` rotates."""
     if np.array_equal(matrix, FLIP):
         return "OpenCV's in place of OpenGL's, or the other way round (y and z have the other sign)"
     if matrix[2, 2] == 1:

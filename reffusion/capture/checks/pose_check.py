@@ -60,7 +60,7 @@ class PoseCheck:
 
     @property
     def is_widespread(self) -> bool:
-        """True if at least half of the judged views contradict their poses. It is then unknown which are right."""
+        """True if at least half of the judged views contradict their poses. Which poses are right is then unknown."""
         return 2 * len(self.contradicting) >= max(self.judged, 1)
 
 
@@ -74,8 +74,8 @@ def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callabl
     contradict their poses.
 
     Args:
-        cameras: cameras of undistorted views in the normalised frame.
-        points: [P, 3], sparse points, or points triangulated from optical flow.
+        cameras: cameras of undistorted views in the normalized frame.
+        points: [P, 3], sparse points, or points triangulated from optical flow, in the same frame.
         image_of: function from a view's name to its picture, uint8 [H, W, 3].
     """
     points = points[:: max(1, -(-len(points) // POINTS))]
@@ -175,7 +175,7 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
-    """Return the correlation at a view's pose minus the best at another shift; None if too little can be compared."""
+    """Return the correlation at a view's pose, plus a bonus if high, minus the best elsewhere; None if unknown."""
     if len(others) < LEAST_NEIGHBORS:
         return None
     count = sum(each.seen & view.seen for each in others)
@@ -218,7 +218,7 @@ class Verdict:
         suspects: names of the views that contradict their poses but stay in the scene. These are test views and clean
             views; and training views too, if too few would be left, or if at least half of the judged views contradict.
             Views that `keep` of scene.yaml names are neither outliers nor suspects.
-        sentences: messages to the user. They suggest lines of scene.yaml that change the decision.
+        sentences: messages to the user, which suggest lines of scene.yaml that change the decision.
     """
 
     outliers: tuple[str, ...] = ()
@@ -237,7 +237,9 @@ class Verdict:
 
 
 def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: Sequence[str] = ()) -> Verdict:
-    """Decide which of the contradicting views are left out of the scene, and write the messages to the user.
+    """Decide which of the contradicting views are left out of the scene, and compose the messages to the user.
+
+    Only training views are left out; none if too few would remain, or if at least half of the judged views contradict.
 
     Args:
         keep: names of views that scene.yaml keeps in any case; their contradictions are ignored.

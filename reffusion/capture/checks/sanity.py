@@ -33,7 +33,7 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
     (views whose photographs contradict their poses).
 
     Args:
-        scene: undistorted views in the normalised frame. Its points must be sparse points or points from optical flow,
+        scene: undistorted views in the normalized frame. Its points must be sparse points or points from optical flow,
             not random points.
         image_of: function from a view's name to its picture, uint8 [H, W, 3].
 
@@ -76,7 +76,7 @@ def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a warning about masks that cover most of their pictures and borders, and are probably inverted."""
+    """Return at most one warning: masks cover most of their pictures and borders, so they are probably inverted."""
     shares = {name: float(mask.mean()) for name, mask in masks.items()}
     # even an object close to the camera leaves most of the border free
     border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()

@@ -42,11 +42,11 @@ def keep_points_in_frame(
 
     Args:
         path: file of the points, for the message.
-        points: positions [P, 3] and colors [P, 3].
+        points: positions [P, 3] and colors [P, 3]; P may be 0.
         pictures: view name -> picture file.
 
     Returns:
-        The points; and a message to the user if they were refused, else None.
+        The finite points, or no points; and a message to the user if points were refused, else None.
     """
     finite = np.isfinite(points[0]).all(axis=1)
     positions, colors = points[0][finite], points[1][finite]
@@ -117,13 +117,13 @@ def correlate_colors(
 
 
 def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return which points no clearly nearer point in their cell hides; `uv` [P, 2] is in shares of width and height."""
+    """Return bool [P], True if no point in the same cell is clearly nearer; `uv` [P, 2]: shares of width, height."""
     cells = (uv * CELLS).astype(int) @ (CELLS, 1)
     return depth < NEARLY * nearest_depths(cells, depth)
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """Read a picture's brightness as float64 [h, w] in [0, 255], reduced to at most `SIDE` px on its longer side."""
+    """Read a picture as gray float64 [h, w] in [0, 255] (mean of its colors), at most `SIDE` px on the longer side."""
     return load_thumbnail(path, SIDE) @ GRAY
 
 

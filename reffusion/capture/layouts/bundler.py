@@ -19,7 +19,7 @@ FOCAL_LENGTH = re.compile(r"\s+0\s+[\d.eE+-]+$")  # at the end of a line of a li
 
 
 def find(folder: Path) -> Path | None:
-    """Return the file bundle.out of a scene folder, or a file .out that begins as Bundler's do; None without one."""
+    """Return the file bundle.out of a scene folder, else a file *.out that begins with `HEAD`; None without one."""
     usual = [folder / name for name in PLACES if is_file(folder / name)]
     others = [path for pattern in ("*.out", "*/*.out") for path in sorted(folder.glob(pattern))]
     return next(iter(usual + [path for path in others if path.is_file() and _is_of_bundler(path)]), None)
@@ -50,7 +50,7 @@ def read(folder: Path, source: Path, images: str | None, correction: Correction)
 
 
 def _placed(numbers: np.ndarray) -> PictureCamera:
-    """Return a camera of bundle.out, [5, 3]: focal length and two radial coefficients, rotation, translation."""
+    """Return the camera of `numbers` [5, 3]: focal length with two radial coefficients; rotation; translation."""
     (focal, k1, k2), world_to_camera = (float(n) for n in numbers[0]), np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = FLIP @ numbers[1:4], FLIP @ numbers[4]
     at = lambda size: Lens(*size, focal, focal, size[0] / 2, size[1] / 2, radial=(k1, k2), model="RADIAL")
@@ -65,7 +65,7 @@ def _read_points(rows: list[list[str]], count: int) -> PointCloud:
 
 
 def _list_pictures(folder: Path, source: Path, count: int) -> list[str]:
-    """Return the paths in the first list of `count` pictures that lies beside bundle.out or in the scene's folder."""
+    """Return the paths in the first list of `count` pictures beside `source` or in `folder`; BadInput without one."""
     for place in dict.fromkeys((source.parent, folder)):
         for path in sorted({*place.glob("*list*.txt"), *place.glob("*.lst")}):
             with reading(path, "a list of pictures"):

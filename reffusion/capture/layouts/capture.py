@@ -173,7 +173,7 @@ def resize_lens(lens: Lens, picture: Path) -> Lens:
     """Return the lens, resized to a picture file, or to the picture turned by its EXIF orientation if only that fits.
 
     Raises:
-        BadInput: the aspect ratios differ by more than 2% either way.
+        BadInput: the aspect ratios differ by more than 2%, whether the picture is turned or not.
     """
     sizes = [image_size(picture), image_size(picture, upright=True)]
     for width, height in sizes:

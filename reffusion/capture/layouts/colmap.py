@@ -42,8 +42,8 @@ def find_model(folder: Path) -> Path | None:
 def find_workspace(folder: Path) -> Path | None:
     """Return the folder in which COLMAP put undistorted pictures with their model; None without one.
 
-    The folder has sub-folders `images` and `sparse`, as dense/0 of an automatic reconstruction. It counts if the scene
-    has no other model, or no pictures in the usual folders. Of several folders the one with most pictures is returned.
+    The folder has sub-folders `images` and `sparse`, as dense/0 of an automatic reconstruction. The result is also None
+    if the scene has another model and pictures in a usual folder. Of several folders the one with most pictures counts.
     """
     found = [
         path for path in (folder / "dense", *sorted((folder / "dense").glob("[0-9]*"))) if is_model(path / "sparse")
@@ -173,7 +173,7 @@ def capture_from_model(
 
 
 def _list_test_pictures(folders: Iterable[Path], files: list[str]) -> set[str]:
-    """Return the pictures among `files` that the first list of test pictures in `folders` names."""
+    """Return the pictures among `files` that the first list of test pictures in `folders` names; empty without one."""
     places = [folder / name for folder in folders for name in TEST_LISTS]
     if (source := next((path for path in places if is_file(path)), None)) is None:
         return set()

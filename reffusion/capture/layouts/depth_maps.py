@@ -30,8 +30,8 @@ def points_from_depth(
     Args:
         depths: view name -> file of its depth map (camera z, not disparity), at any size. Without files there are no
             points.
-        scale: length in the scene's units of the number 1 in a depth map of integers (a picture). Depth maps of floats
-            (.npy, .exr) are in the scene's units.
+        scale: length in the scene's units of the number 1 in a depth map that is a picture of integers. The scale does
+            not apply to .npy and .exr, which are in the scene's units.
         pictures: view name -> picture file.
         lenses: view name -> lens, at any size.
         world_to_camera: view name -> pose [4, 4].

@@ -51,8 +51,8 @@ def read(
         images: folder of pictures, relative to the scene; None to choose a size of the usual folders.
         longest: requested longer side of the pictures in pixels. The smallest size with at least as many is chosen,
             else the largest size.
-        references: files of references (inpainted views), which are not views. They are left out if the numbers of
-            pictures and of rows in poses_bounds.npy differ.
+        references: files of references (inpainted views), which are not views. References among the pictures are
+            left out if the numbers of pictures and of rows in poses_bounds.npy differ.
         correction: what is changed in the poses.
 
     Raises:
@@ -143,7 +143,7 @@ def _load_poses_bounds(source: Path) -> np.ndarray:
 def _lens_of_partial_model(
     model: Path, lenses: dict[str, Lens], pictures: dict[str, Path], warnings: list[str]
 ) -> dict[str, Lens]:
-    """Return the lenses of a partial model (COLMAP without images) if focal lengths agree, else `lenses`; may warn."""
+    """Return a partial model's lenses, else `lenses`; add to `warnings` if the focal lengths disagree."""
     file = model_file(model, "cameras") if model.is_dir() else None
     cameras = list(load_cameras(file).values()) if file else []
     if file is None or len(cameras) != 1:
@@ -164,7 +164,7 @@ def _points_of_partial_model(
     bounds: dict[str, tuple[float, float]],
     warnings: list[str],
 ) -> PointCloud:
-    """Return a partial model's points (COLMAP without images) if they are in the poses' frame, else none and warn."""
+    """Return a partial model's points, else none; add to `warnings` if points are not in the frame of the poses."""
     file = model_file(model, "points3D") if model.is_dir() else None
     if file is None:
         return NO_POINTS

@@ -19,7 +19,7 @@ FISHEYE = ("fisheye", "fisheye_opencv")
 
 
 def find(folder: Path) -> Path | None:
-    """Return the file in a scene folder, or in its sub-folder of a project of OpenDroneMap; None without one."""
+    """Return reconstruction.json in a scene folder, or in its sub-folder opensfm (OpenDroneMap); None without one."""
     return next((path for path in (folder / NAME, folder / "opensfm" / NAME) if is_file(path)), None)
 
 

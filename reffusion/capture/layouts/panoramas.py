@@ -54,7 +54,7 @@ def _read_head(path: Path) -> tuple[bool, bool]:
 
 
 def _is_closed(path: Path) -> bool:
-    """Return whether the left and right border of a picture show the same, as neighboring columns do."""
+    """Return whether the left and right border of a picture show the same, and are not plain."""
     pixels = load_thumbnail(path, SIDE).astype(np.float32)
     left, right = pixels[:, 0], pixels[:, -1]
     inside = np.abs(np.diff(pixels, axis=1)).mean(axis=(0, 2))

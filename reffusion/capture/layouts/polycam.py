@@ -18,7 +18,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from the axes of ARKit's cameras (y up
 
 
 def find(folder: Path) -> Path | None:
-    """Return the folder of cameras in a scene folder with raw data of Polycam; None if it is no such folder."""
+    """Return the folder of cameras in raw data of Polycam, preferably corrected ones; None in other folders."""
     for kind in (CORRECTED, CAPTURED):
         cameras = folder / "keyframes" / f"{kind}cameras"
         if any(cameras.glob("*.json")) and has_pictures(_image_folder(cameras)):
@@ -31,7 +31,11 @@ def _image_folder(cameras: Path) -> Path:
 
 
 def read(folder: Path, source: Path, images: str | None, correction: Correction) -> Capture:
-    """Read the capture. `source`: the folder of cameras; `images`, `correction`: as in `read_placed`."""
+    """Read the capture. `source`: the folder of cameras; `images`, `correction`: as in `read_placed`.
+
+    Raises:
+        BadInput: the file of a camera is damaged; or as for `read_placed`.
+    """
     files = {path.stem: path for path in sorted(source.glob("*.json")) if not path.name.startswith(".")}
     usual = _image_folder(source).relative_to(folder).as_posix()
     placed = {name: _load_camera(path) for name, path in files.items()}

@@ -19,7 +19,7 @@ def read_matrices(values: Sequence[object], names: Sequence[str], source: Path) 
     transposed.
 
     Args:
-        values: N matrices as JSON has them: nested lists of 3x4 or 4x4 numbers, or flat lists of 16.
+        values: N > 0 matrices as JSON has them: nested lists of 3x4 or 4x4 numbers, or flat lists of 16.
         names: the N pictures of the matrices, for messages.
         source: the file, for messages.
 

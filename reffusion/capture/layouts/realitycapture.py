@@ -2,8 +2,8 @@
 
 A row holds the position of a camera (x, y, alt), its orientation in degrees, and its lens. Heading, pitch and roll of 0
 mean a camera that looks down the axis of alt, with the top of its picture towards y. The heading turns it clockwise as
-seen from above; pitch and roll turn it about its own x and y axis. The focal length is that of a picture 36 mm wide.
-The principal point is an offset from the picture's center, in units of the longer side.
+seen from above; pitch and roll turn it about its own x and y axis. The focal length is in mm for a picture whose longer
+side is 36 mm. The principal point is an offset from the picture's center, in units of the longer side.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ FLIP = np.diag([1.0, -1.0, -1.0])  # from the axes of a camera of the file (y up
 
 
 def find(folder: Path) -> Path | None:
-    """Return the first CSV file in the scene's folder that has these columns; None without such a file."""
+    """Return the first CSV file in the scene's folder that has the columns `COLUMNS`; None without such a file."""
     return next((path for path in sorted(folder.glob("*.csv")) if path.is_file() and _columns(path)[1]), None)
 
 
 def _columns(path: Path) -> tuple[int, list[str]]:
-    """Return the number of lines up to the column names, and the names in lower case; none for another kind of file."""
+    """Return the line number, from 1, of the column names, and the names in lower case; (0, []) for other files."""
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
         # a line with the number of cameras may stand before the names
         for number in (1, 2):

@@ -17,7 +17,7 @@ KEYS = (b"img_name", b"position", b"rotation")  # of each camera, by which the f
 
 
 def find(folder: Path) -> Path | None:
-    """Return cameras.json of a scene folder if it is of this kind; other programs also write files of this name."""
+    """Return cameras.json of a scene folder; None without it, and for the files of this name of other programs."""
     if not is_file(path := folder / NAME):
         return None
     beginning = path.read_bytes()[:4000]
@@ -25,7 +25,11 @@ def find(folder: Path) -> Path | None:
 
 
 def read(folder: Path, source: Path, images: str | None, correction: Correction) -> Capture:
-    """Read the capture. `source`: cameras.json; `images`, `correction`: as in `read_placed`."""
+    """Read the capture. `source`: cameras.json; `images`, `correction`: as in `read_placed`.
+
+    Raises:
+        BadInput: the file is of another form, or has two cameras of one picture; or as for `read_placed`.
+    """
     record = load_json(source)
     with as_bad_input(source, "cameras of 3D Gaussian Splatting"):
         names = [str(each["img_name"]) for each in record]

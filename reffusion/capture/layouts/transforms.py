@@ -51,7 +51,8 @@ class Frame:
         values: the keys of the frame, together with the keys of the whole file that the frame does not have.
         file_path: value of the frame's key `file_path`: a path of its picture, which need not exist.
         source: the transforms file.
-        split: "train" or one of `HELD_OUT`, by the file's name or by the file's own lists; "" if neither tells.
+        split: "train", one of `HELD_OUT`, or `UNUSED`, by the file's name or by the file's own lists; "" if neither
+            tells.
         matrix: [4, 4] float64, OpenGL's camera-to-world pose (y up, looking along -z).
         transposed: True if the file has the matrix transposed.
     """
@@ -84,7 +85,7 @@ def _is_without_lenses(path: Path) -> bool:
 
 
 def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) -> Capture:
-    """Read a scene folder with transforms files.
+    """Read a scene folder with transforms files (`split_files`), at least one.
 
     The test views of Blender's files are the frames of transforms_test.json, or without that file those of
     transforms_val.json, which is otherwise not read. Those of transforms.json are its `test_filenames`, or without them
@@ -166,7 +167,7 @@ def read_cameras(folder: Path) -> Poses:
 
 
 def has_pictures(folder: Path) -> bool:
-    """Return whether a picture of at least one frame exists."""
+    """Return whether a picture of at least one frame exists; raises BadInput if a file or frame is wrong."""
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
     return bool(_find_pictures(folder, None, frames))
 
@@ -185,7 +186,7 @@ def _load_frames(source: Path, split: str) -> list[Frame]:
 
 
 def _frames(record: object, source: Path) -> list[dict]:
-    """Return the list `frames` of a parsed transforms file. Raises BadInput if it is missing or a frame lacks a key."""
+    """Return the frames of a parsed transforms file, its list `frames` or the file itself; raises BadInput if wrong."""
     frames = record.get("frames") if isinstance(record, dict) else record
     if not isinstance(frames, list) or not frames:
         raise BadInput(f"{source}: it has no list `frames`")
@@ -196,7 +197,7 @@ def _frames(record: object, source: Path) -> list[dict]:
 
 
 def _listed_splits(shared: Mapping[str, Any], names: list[str], source: Path) -> dict[str, str]:
-    """Return file_path -> split by the lists `*_filenames`; raises BadInput for a name that is no frame's."""
+    """Return file_path -> split by the lists `*_filenames`, {} without lists; raises BadInput for an unknown name."""
     lists = {split: shared[f"{split}_filenames"] for split in ("train", *HELD_OUT) if shared.get(f"{split}_filenames")}
     # a frame in no list is unused, unless there is no train_filenames
     splits = dict.fromkeys(names, UNUSED if "train" in lists else "train") if lists else {}

@@ -65,7 +65,7 @@ def read_number(values: dict[str, Any], key: str, default: float, picture: Path,
         picture, source: the frame's picture and the transforms file, for messages.
 
     Raises:
-        BadInput: the value is no number, or not below 1e12 in size.
+        BadInput: the value is no number, is NaN, or has an absolute value of 1e12 or more.
     """
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:

@@ -91,10 +91,10 @@ POSE_FILES = (
 
 
 def add_warnings(folder: Path, capture: Capture) -> Capture:
-    """Return the capture with a warning for each kind of file that is not read, and without poses for poses, too.
+    """Return the capture with warnings about pictures that are not read and, if it has no poses, files with poses.
 
-    Pictures that are not read count as left out, so that their masks are not refused. A picture that lies there in
-    another format under the same name needs no warning.
+    Pictures that are not read count as left out, so that their masks are not refused. A picture that the capture also
+    holds in another format, under the same name, needs no warning.
 
     Args:
         folder: the scene's folder.
@@ -111,7 +111,7 @@ def add_warnings(folder: Path, capture: Capture) -> Capture:
 
 
 def describe_poses(folder: Path, places: Sequence[Path]) -> list[str]:
-    """Return a sentence for each kind of file with poses that is not read, in the scene's folder and in `places`."""
+    """Return a sentence for each file with poses that is not read, one of each kind, in `folder` and in `places`."""
     sentences: dict[Path, str] = {}
     for kind in POSE_FILES:
         files = [path for place in dict.fromkeys((folder, *places)) for path in sorted(place.glob(kind.pattern))]
@@ -134,7 +134,7 @@ def _begins_with(path: Path, word: bytes) -> bool:
 
 
 def refuse_without_pictures(folder: Path, usual: Sequence[str]) -> BadInput:
-    """Return the error of a scene folder without pictures in the usual folders; the message names what lies there."""
+    """Return the error of a scene folder without pictures in the `usual` folders; the message suggests a remedy."""
     places = [folder / name for name in usual]
     hints = [each for place in places for each in _describe_pictures(folder, place, _unread_pictures(place))]
     files = [path for pattern in DEPTHS for path in sorted(folder.glob(pattern)) if not path.name.startswith(".")]

@@ -50,8 +50,8 @@ class Completion:
         image: uint8 [H, W, 3].
         misfit: how badly the patches fit on the whole: the mean of their misfits (`search.misfit`), in which pixels
             near the hole's border weigh most and pixels without a patch are left out. Of several completions of one
-            hole, the one with the least misfit mostly looks best. It is `NO_MATCH` if there were too few patches and
-            Telea's method filled the hole, or if no pixel has a patch, and 0 if the hole is empty.
+            hole, the one with the least misfit mostly looks best. The value is `NO_MATCH` if there were too few patches
+            and Telea's method filled the hole, or if no pixel has a patch, and 0 if the hole is empty.
     """
 
     image: np.ndarray
@@ -66,7 +66,7 @@ def complete(
     Args:
         target: the view; its image is read outside the hole only.
         hole: bool [H, W], the pixels to fill.
-        sources: images from which patches are taken, which may include the view's own photograph.
+        sources: images from which patches are taken, at least one; the view's own photograph may be among them.
         smooth: indices of the smooth planes, whose perspective patches follow. On rough ground this would smear grass.
         seed: seed of the random search.
     """
@@ -119,7 +119,7 @@ def _blend_patches(image: np.ndarray, hole: np.ndarray, level: PyramidLevel, mat
 def _build_pyramid(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int]
 ) -> list[tuple[np.ndarray, np.ndarray, Sources]]:
-    """Return for each level, coarsest first, the target's features, hole and sources; none if there are few patches."""
+    """Return for each level, coarsest first, features, hole and sources; [] if the finest level has few patches."""
     width = 2 * _distance_inside(hole).max()
     count = 1 + int(np.ceil(np.log2(max(width / COARSEST_WIDTH, 2.0 if width > SINGLE_LEVEL_WIDTH else 1.0))))
     current, mask, scale = _color_features(target.image, hole), hole, 1
@@ -253,7 +253,7 @@ def _from_coarser(matches: Matches, coarser: Hole, level: PyramidLevel) -> Match
 def _vote(
     level: PyramidLevel, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None
 ) -> None:
-    """Set the first `VOTED` channels of hole pixels `todo` (None: all) to the weighted mean of covering patches."""
+    """Vote on the first `VOTED` channels of the hole pixels `todo` (None: all), and write them to `level.current`."""
     todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
     # the weight of a patch falls by a factor of e per `spread` of misfit
     voting.vote(todo, matches, level.hole, trust, level.sources, spread, voted)

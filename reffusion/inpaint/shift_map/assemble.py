@@ -165,7 +165,7 @@ def assemble(
         target: the view; its image is read outside the hole only.
         hole: bool [H, W].
         pixels: the pixels of the hole to fill, and pixels of its ring, at least one of each.
-        candidates: the photographs from which pieces are taken.
+        candidates: the photographs from which pieces are taken, at least one.
         region: bool [H, W], the surface to fill. Colors of pixels beside it do not enter the blending.
     """
     coarse, stride = pixels.subsample()

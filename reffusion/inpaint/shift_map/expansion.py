@@ -21,7 +21,7 @@ def features(
 ) -> np.ndarray:
     """Return [N, 8] float32, the features by which the appearance of a candidate is compared at N pixels.
 
-    They are the weighted color, the detail, and the weighted gradient of the gray detail.
+    The features are the weighted color, the detail, and the weighted gradient of the gray detail.
 
     Args:
         rows, columns: [N], positions of the pixels, on a grid with a spacing of `stride` px.

@@ -58,8 +58,8 @@ def fill_plane(
         symmetry: how the texture of the plane repeats itself.
 
     Returns:
-        The target's picture with these pixels filled, and the filled pixels. No pixel is filled if no photograph shows
-        enough of the plane, if too little of it is known around the hole, or if no motion suits.
+        The target's picture with the filled pixels changed, and the filled pixels. No pixel is filled if no photograph
+        shows enough of the plane, if too little of the plane is known around the hole, or if no motion suits.
     """
     nothing = Assembly(target.image, np.zeros_like(hole))
     on_plane = _without_specks(target.plane == plane)
@@ -96,7 +96,7 @@ class PlanePhoto:
             plane: index of the plane.
 
         Returns:
-            None if the source shows fewer than `MIN_PHOTO_PIXELS` pixels of the plane, or they fit no homography.
+            None if the source shows fewer than `MIN_PHOTO_PIXELS` usable pixels of the plane, or no homography fits.
         """
         on_plane = source.plane == plane
         readable = erode_readable(source, source.masked) & _without_specks(on_plane)
@@ -141,13 +141,14 @@ class PlaneMotions:
     motions: Sequence[Motion]
 
     def with_motions(self, motions: Sequence[Motion]) -> PlaneMotions:
-        """Return candidates with other motions."""
+        """Return the candidates with `motions` in place of the present ones."""
         return PlaneMotions(self.target, self.photos, self.symmetry, motions)
 
     def __len__(self) -> int:
         return len(self.motions)
 
     def sample(self, k: int, pixels: HolePixels) -> Samples:
+        """Return the appearance of candidate k at the pixels."""
         motion = self.motions[k]
         at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
         return Samples(_sample(photo.colors, at), _sample(photo.detail, at), _is_set(photo.readable, at))

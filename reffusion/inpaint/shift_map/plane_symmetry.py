@@ -158,7 +158,7 @@ def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
 
 
 def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
-    """Return the normalised correlation [h, w] of a map with itself after shifts by cells, ordered as in an FFT."""
+    """Return the normalized correlation [h, w] of a map with itself after shifts by cells, ordered as in an FFT."""
     known = cv2.erode(plane_map.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
     gray = plane_map.values.mean(2)
     detail = np.where(known, gray - cv2.GaussianBlur(gray, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
