@@ -24,6 +24,7 @@ from reffusion.capture.checks.agreement import judge_poses
 from reffusion.capture.layouts.capture import invert_pose
 from reffusion.capture.load import load_capture
 from reffusion.io.files import BadInput
+from reffusion.io.ply import save_points
 from reffusion.io.scene import load_scene
 from reffusion.params.poses import Params
 from reffusion.types import Camera
@@ -160,6 +161,11 @@ def test_photographs_that_are_shifted_against_their_poses(tmp_path, shift):
     text = sorted(NAMES)
     given = {name: true_poses()[text[(k + shift) % VIEWS]] for k, name in enumerate(text)}
     folder = write(tmp_path / "s", given)
+    random = np.random.default_rng(
+        0
+    )  # points of the far wall, with wrong colors: they are compared
+    points = np.concatenate([random.uniform(-0.5, 0.5, (500, 2)), np.ones((500, 1))], 1)
+    save_points(folder / "sparse_pc.ply", points, random.integers(0, 256, (500, 3)).astype(np.uint8))
     verdict = judge_poses(load_capture(folder))
     assert f"its poses are shifted against the photographs by {abs(shift)}" in verdict.describe(folder)
     capture = load_capture(folder, correction=verdict.correction)

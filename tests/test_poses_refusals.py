@@ -48,9 +48,19 @@ def drop_masks(folder: Path) -> None:
         path.unlink()
 
 
+def move_pictures(folder: Path) -> None:
+    drop_masks(folder)
+    elsewhere = (folder / "images").rename(folder.with_name("elsewhere"))
+    edit_transforms(lambda r: [e.update(file_path=str(elsewhere / Path(e["file_path"]).name)) for e in r["frames"]])(
+        folder
+    )
+
+
 REFUSALS = [
     ("mask for no picture", lambda f: write_masks(f / "masks", ["zz"]), {}, r"zz\.png.*no picture"),
     ("no mask at all", drop_masks, {}, "no mask at all.*masks: none"),
+    ("no file of the layout", lambda f: (f / "transforms.json").unlink(), {"layout": "transforms"}, "correct `layout`"),
+    ("no mask, pictures elsewhere", move_pictures, {}, "no mask at all.*masks: none"),
     ("named masks missing", None, {"masks": "nowhere"}, "nowhere.*correct `masks`"),
     ("empty masks", lambda f: write_masks(f / "masks", [f"v{k:02d}" for k in range(6)], value=0), {}, "are empty"),
     ("mask of other proportions", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH)), {}, r"v01\.png.*72x96"),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, pair_masks, strip_ending
+from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, pair_masks, shorten_path, strip_ending
 from reffusion.io.annotations import annotated_pictures, is_labelme
 from reffusion.io.files import BadInput
 from reffusion.io.given_masks import WHITE, MaskValues
@@ -91,7 +91,7 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
     if optional:
         return FoundMasks({})
     raise BadInput(
-        f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in places)}"
+        f"{folder}: no mask at all (looked for {', '.join(shorten_path(p, folder) for p in places)}"
         f"{''.join(map(_unread, places))}); click on "
         f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
         "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"

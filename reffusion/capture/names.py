@@ -31,6 +31,11 @@ def normalize_path(path: str) -> str:
     return "/".join(part for part in parts if part not in ("", ".") and not part.endswith(":"))
 
 
+def shorten_path(path: Path, folder: Path) -> str:
+    """Return the path relative to a folder, for messages; the whole path if it lies elsewhere."""
+    return path.relative_to(folder).as_posix() if folder in path.parents else str(path)
+
+
 def strip_ending(path: str) -> str:
     """Return the path without the ending of a picture format (`ENDINGS`). Other endings count as part of the name."""
     stem, dot, ending = path.rpartition(".")

@@ -61,7 +61,8 @@ def keep_points_in_frame(
     if apart > 0 and np.median([np.median(z) for z in depths if len(z)]) > FARTHEST * apart:
         return refused
     if _has_contrast(colors @ GRAY):
-        names = list(pictures)[:: -(-len(pictures) // VIEWS)]
+        placed = [name for name in pictures if name in poses.lenses]  # a correction may leave out views
+        names = placed[:: -(-len(placed) // VIEWS)]
         of_view = lambda n: (read_gray(pictures[n]), poses.lenses[n], poses.world_to_camera[n])
         fits = np.array([correlate_colors(*of_view(name), positions, colors) for name in names])
         if (known := ~np.isnan(fits)).any() and np.median(fits[known]) < CORRELATED:

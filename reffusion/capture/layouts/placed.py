@@ -22,7 +22,7 @@ from reffusion.capture.layouts.capture import (
     resize_lens,
 )
 from reffusion.capture.lens import Lens
-from reffusion.capture.names import list_pictures, name_views, pair_pictures
+from reffusion.capture.names import list_pictures, name_views, pair_pictures, shorten_path
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
@@ -78,7 +78,7 @@ def read_placed(
     if place is None:
         raise BadInput(
             f"{source}: none of its {len(placed)} pictures ({', '.join(list(placed)[:3])}, ...) is in "
-            f"{', '.join(path.relative_to(folder).as_posix() for path in places)}; name their folder as `images` in "
+            f"{', '.join(shorten_path(path, folder) for path in places)}; name their folder as `images` in "
             "scene.yaml"
         )
     file_of = pairs[place]

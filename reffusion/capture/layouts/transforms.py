@@ -101,6 +101,8 @@ def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) ->
         BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture and differ.
     """
     sources = split_files(folder)
+    if not sources:
+        raise BadInput(f"{folder}: no transforms.json, and no transforms_train.json; correct `layout` in scene.yaml")
     unread = [sources.pop(split).name for split in [each for each in HELD_OUT if each in sources][1:]]
     frames = [frame for split, source in sources.items() for frame in _load_frames(source, split)]
     source = next(iter(sources.values()))
@@ -311,7 +313,8 @@ def _points(
     elif listed:
         messages.append(f"{path}: named by {source.name}, but missing")
     # without points in the frame of the poses, points are made from depth maps
-    if depths := _named_files(folder, placed, "depth_file_path"):
+    in_poses = {view: each for view, each in placed.items() if view in poses.lenses}  # a correction may leave out views
+    if depths := _named_files(folder, in_poses, "depth_file_path"):
         scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
         depth_points = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
         points_in_frame, refused = keep_points_in_frame(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reffusion.capture.names import list_pictures, strip_ending
+from reffusion.capture.names import list_pictures, shorten_path, strip_ending
 from reffusion.io.files import VIDEOS, BadInput
 
 if TYPE_CHECKING:
@@ -118,14 +118,10 @@ def describe_poses(folder: Path, places: Sequence[Path]) -> list[str]:
         path = next((path for path in files[:MOST] if path.is_file() and _begins_with(path, kind.word)), None)
         if path is not None:
             sentences[path] = (
-                f"{_relative(path, folder)} ({kind.program}) is not read; {kind.remedy}; without that, poses are "
+                f"{shorten_path(path, folder)} ({kind.program}) is not read; {kind.remedy}; without that, poses are "
                 "solved anew, in another frame"
             )
     return list(sentences.values())
-
-
-def _relative(path: Path, folder: Path) -> str:
-    return path.relative_to(folder).as_posix() if folder in path.parents else str(path)
 
 
 def _begins_with(path: Path, word: bytes) -> bool:
@@ -140,7 +136,7 @@ def refuse_without_pictures(folder: Path, usual: Sequence[str]) -> BadInput:
     files = [path for pattern in DEPTHS for path in sorted(folder.glob(pattern)) if not path.name.startswith(".")]
     hints += [f"give the video itself: scene={path}" for path in files if path.suffix.lower() in VIDEOS]
     hints += [
-        f"{_relative(path, folder)} holds {count} picture{'s' * (count > 1)}: "
+        f"{shorten_path(path, folder)} holds {count} picture{'s' * (count > 1)}: "
         + (
             f"name their folder as `images: {path.name}` in scene.yaml"
             if path.parent == folder
@@ -162,7 +158,7 @@ def _unread_pictures(place: Path) -> list[Path]:
 
 def _describe_pictures(folder: Path, place: Path, pictures: Sequence[Path]) -> list[str]:
     """Return a sentence for each ending of the pictures, all of which lie in `place`."""
-    where = "the folder" if place == folder else _relative(place, folder)
+    where = "the folder" if place == folder else shorten_path(place, folder)
     counts = Counter(path.suffix for path in pictures)
     return [
         f"{where} holds {count} {ending} pictures ({PICTURES[ending.lower()][0]}), which are not read; "
