@@ -66,7 +66,7 @@ def align(
     Raises:
         Degenerate: Fewer than 4 pixels have positive weight, or the spread of the estimate at these pixels is below
             1e-6 of its magnitude (a constant determines no scale).
-        ValueError: Shapes differ, or values are not finite.
+        ValueError: Shapes differ, or a value at a pixel of positive weight is not finite.
     """
     estimate, target = np.asarray(estimate, np.float64), np.asarray(target, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
@@ -85,8 +85,8 @@ def align(
 def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
     """Return two condition numbers of the normal equations: first in plain form, then in the form that `align` solves.
 
-    `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. Only
-    the rounding of the mean relative to the spread remains.
+    `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. The
+    second number therefore exceeds 1 only by the rounding of the mean relative to the spread.
 
     Args:
         estimate, weights: As in `align`. The estimate is not constant.
@@ -103,7 +103,7 @@ def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -
 def _robust_line(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, generator: torch.Generator
 ) -> Alignment:
-    """Fit a line to estimates x and targets y, [S] each, by M-estimation with weights w > 0, [S]."""
+    """Return the robust fit of targets y to estimates x, [S] each, by M-estimation with weights w > 0, [S]."""
     # `plain` is the least-squares fit, the start if no line is better than chance.
     result, share = _consensus(x, y, w, generator) or (plain, 1.0)
     for _ in range(MAX_REWEIGHTINGS):
@@ -166,6 +166,7 @@ def _consensus(
 
 
 def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
+    """Return the least-squares fit of y to x with weights w > 0, [S] each. Raises Degenerate if x is constant."""
     total = w.sum()
     x_mean, y_mean = (w @ x) / total, (w @ y) / total
     dx, dy = x - x_mean, y - y_mean
@@ -177,6 +178,7 @@ def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
 
 
 def _check_not_constant(x: np.ndarray, mean: float, spread: float) -> None:
+    """Raise Degenerate if the spread of x, [S], is below `MIN_RELATIVE_SPREAD` of its largest value."""
     if spread <= MIN_RELATIVE_SPREAD * np.abs(x).max():
         raise Degenerate(
             "constant",
@@ -201,9 +203,9 @@ def align_depth(
         robust: See `align`.
 
     Returns:
-        The aligned estimate as depth, also at known pixels. Where the aligned disparity is not positive or is close to
-            0, the depth is the largest known depth. With `space` "depth", the smallest known depth replaces aligned
-            depths that are not positive.
+        The aligned estimate as depth, also at known pixels. Where the aligned disparity is negative, NaN or less than
+            1/1000 of that of the largest known depth, this depth replaces it. With `space` "depth", the smallest known
+            depth replaces aligned depths that are NaN or not positive.
 
     Raises:
         Degenerate: As `align`.

@@ -69,6 +69,7 @@ class CompletionSettings:
 
     @property
     def solver(self) -> bilateral.Solver:
+        """Return the parameters of the bilateral solver."""
         return bilateral.Solver(self.solver_smoothness, self.solver_spatial, self.solver_luma, self.solver_chroma)
 
 
@@ -329,12 +330,13 @@ def _in_free_space(view: ViewDepth, disparity: np.ndarray) -> np.ndarray:
 def points_around(view: ViewDepth, points: np.ndarray, settings: CompletionSettings) -> tuple[np.ndarray, np.ndarray]:
     """Return the sparse points that are visible around the hole: image points [S, 2] in pixels, and disparities [S].
 
-    They lie in a ring (`settings.ring`) around the pixels of the hole and of the removed object.
+    The points lie in a ring (`settings.ring`) around the pixels of the hole and of the removed object.
     """
     return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
 
 
 def _surroundings(view: ViewDepth, settings: CompletionSettings) -> np.ndarray:
+    """Return bool [H, W], the ring (`settings.ring`) around the pixels of the hole and of the removed object."""
     excluded = view.hidden | view.hole
     return morphology.dilate_by_distance(excluded, settings.ring) & ~excluded
 
@@ -366,6 +368,7 @@ def _fit_planar_model(
 def _fit_planes(
     view: ViewDepth, pixels: np.ndarray, values: np.ndarray, settings: CompletionSettings
 ) -> planes.PlanarModel:
+    """Return planes fitted to samples: image points [S, 2] in pixels, and their disparities [S]."""
     generator = seeding.generator(settings.seed, "planes", view.camera.name)
     return planes.planar_model(pixels, values, view.hole.shape, generator, tolerance=settings.planar_tolerance)
 
@@ -379,7 +382,8 @@ def visible_points(
         points: [P, 3] points in the world.
         camera: The camera of the view.
         pixels: bool [H, W].
-        disparity: [H, W] of the view, 0 where unknown. A point that is clearly farther is hidden.
+        disparity: [H, W] of the view. A point that is clearly farther is hidden. Where the disparity is 0 (unknown), no
+            point in front of the camera is hidden.
     """
     uv, z = geometry.project(points, camera)
     on_pixels, inside = geometry.sample_nearest(pixels, uv)

@@ -25,7 +25,7 @@ class Solver:
         smoothness: The weight lambda of the smoothness term relative to the data term.
         spatial: Size of the bilateral grid's cells in pixels.
         luma, chroma: Size of the cells in levels of 8-bit YUV.
-        rounds: Number of bistochastisation steps.
+        rounds: Number of bistochastization steps.
     """
 
     smoothness: float = 128.0
@@ -91,7 +91,7 @@ def solve(
         confidence: [H, W] >= 0.
         guide: [H, W, 3] image, uint8 or in [0, 1].
         solver: Parameters of the solver.
-        watch: Called after each iteration, see `Watch`.
+        watch: Called after each iteration, see `Watch`. A constant target takes no iteration.
 
     Returns:
         [H, W] float64. Cells that no confidence reaches have the confidence-weighted mean of the target.
@@ -135,9 +135,10 @@ def solve(
 def build_system(
     confidence: np.ndarray, guide: np.ndarray, solver: Solver = DEFAULT_SOLVER
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return the matrix of the solver's linear system, [V, V], and the vertex of each pixel, int [H * W].
+    """Return the matrix of the solver's linear system, [V, V], and the index of each pixel's vertex, int [H * W].
 
-    The matrix is symmetric and positive definite. V is the number of vertices of the bilateral grid.
+    The matrix is symmetric and positive definite. V is the number of vertices of the bilateral grid. The pixels are in
+    row-major order.
 
     Args:
         confidence: [H, W] >= 0.
@@ -167,7 +168,7 @@ def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float,
 
 
 def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertex of each pixel in the bilateral grid of a guide, int [H * W], and the vertices, int [V, 5]."""
+    """Return the index of each pixel's vertex in the bilateral grid, int [H * W], and the vertices, int [V, 5]."""
     levels = 255.0 * unit_range(guide)
     luma = levels @ (0.299, 0.587, 0.114)
     chroma = (levels[..., [2, 0]] - luma[..., None]) * (0.564, 0.713)
@@ -204,9 +205,9 @@ def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
 
 
 def _laplacian(blur: sparse.csr_matrix, mass: np.ndarray, rounds: int) -> sparse.csr_matrix:
-    """Return the graph Laplacian [V, V] of the blur matrix after bistochastisation to the row sums `mass`, [V]."""
+    """Return the graph Laplacian [V, V] of the blur matrix after bistochastization to the row sums `mass`, [V]."""
     balance = np.ones(len(mass))
-    # Bistochastisation scales the blur matrix symmetrically so that its row sums become `mass`, the number of pixels of
+    # Bistochastization scales the blur matrix symmetrically so that its row sums become `mass`, the number of pixels of
     # each vertex.
     for _ in range(rounds):
         balance = np.sqrt(balance * mass / (blur @ balance))

@@ -18,12 +18,11 @@ MAX_ANGLE_DEG = 30  # degrees from the reference's view; beyond this the missing
 
 
 def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return [H, W] camera z, which is `depth`, and at `object_pixels` the depth of upright billboards.
+    """Return a copy of `depth`, [H, W] camera z, with the depth of upright billboards at `object_pixels`.
 
-    Each connected component of the object becomes one billboard. It stands upright on the surface below its lowest
-    pixels, or faces the camera if the camera looks at this surface almost head-on, as at a wall. It bulges towards the
-    camera inside its outline. The sides and the back of the object remain unknown.
-    Nowhere is the billboard farther than `depth`.
+    Each connected component of the object becomes one billboard. The billboard stands upright on the surface below its
+    lowest pixels, or faces the camera if the camera looks at this surface almost head-on, as at a wall. It bulges
+    towards the camera inside its outline, and is nowhere farther than `depth`.
 
     Args:
         object_pixels: bool [H, W], True at pixels of the inserted object.

@@ -67,7 +67,7 @@ def complete(
     rounding), whatever the guide's texture.
 
     PAPER leaves open: how the depth of a hole is found without a monocular estimator. Second differences of the
-    disparity are penalised, because a penalty on first differences bends every plane.
+    disparity are penalized, because a penalty on first differences bends every plane.
 
     Args:
         disparity: [H, W], read where `confidence` > 0.
@@ -144,9 +144,9 @@ def build_system(confidence: np.ndarray, guide: np.ndarray | None, domain: np.nd
     """Return the sparse matrix of the completion over the P pixels of `domain`, [P, P], symmetric positive definite.
 
     Args:
-        confidence: [H, W].
-        guide: [H, W, C] in [0, 1], or None.
-        domain: bool [H, W].
+        confidence: [H, W] >= 0, positive at 3 pixels of the domain that are not on one line.
+        guide: [H, W, C] in [0, 1]. None: all second differences have the same weight.
+        domain: bool [H, W]. Rows and columns of the matrix have the row-major order of its pixels.
         plate: Settings of the plate.
     """
     bend = _bending(domain, guide, plate.edge)
@@ -154,7 +154,7 @@ def build_system(confidence: np.ndarray, guide: np.ndarray | None, domain: np.nd
 
 
 def factorize(system: sparse.csc_matrix):
-    """Return the sparse LU factors of a symmetric matrix."""
+    """Return the sparse LU factors of a symmetric matrix, whose method `solve` takes a right-hand side."""
     return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
@@ -202,6 +202,7 @@ def _solve_coarsely(residual, data, guide, domain, plate: Plate) -> np.ndarray:
 
 
 def _block_sum(array: np.ndarray, factor: int) -> np.ndarray:
+    """Return the sums of an array [H, W] over blocks of `factor` x `factor` pixels; missing pixels count as 0."""
     height, width = (-(-n // factor) * factor for n in array.shape)
     padded = np.zeros((height, width))
     padded[: array.shape[0], : array.shape[1]] = array
@@ -209,6 +210,7 @@ def _block_sum(array: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _check_determines_plane(known: np.ndarray) -> None:
+    """Raise Degenerate if the known pixels, bool [H, W], are fewer than 3 or lie on one line."""
     rows, columns = np.nonzero(known)
     if len(rows) < 3 or np.linalg.matrix_rank(np.stack([rows - rows[0], columns - columns[0]])) < 2:
         raise Degenerate(
@@ -227,6 +229,7 @@ def _bending(domain: np.ndarray, guide: np.ndarray | None, edge: float) -> spars
 
 
 def _stencil_rows(index: np.ndarray, guide: np.ndarray | None, stencil, edge: float) -> sparse.csr_matrix:
+    """Return the rows of `_bending` for one of `STENCILS`; `index` [H, W] numbers the pixels, -1 outside the domain."""
     stencil_height, stencil_width = (1 + max(s[axis] for s in stencil) for axis in (0, 1))
     height, width = index.shape
     shifted = lambda array, dr, dc: array[dr : height - stencil_height + 1 + dr, dc : width - stencil_width + 1 + dc]

@@ -17,7 +17,7 @@ COLOR = 20.0  # of 255: color difference at which the weight of a neighbor falls
 
 
 def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return a depth map [H, W] without ramps between a surface and the surface behind it.
+    """Return a copy of a depth map [H, W] without ramps between a surface and the surface behind it.
 
     A rendering of Gaussians, and a smooth continuation, blend the depths of two surfaces along their border. A Gaussian
     at such a depth would hang in the air as a streak along the line of sight. Each pixel beside a step gets the
@@ -72,4 +72,5 @@ def beside_steps(depth: np.ndarray) -> np.ndarray:
 
 
 def _radius(depth: np.ndarray) -> int:
+    """Return half the side of the window, in px, for a map of this width."""
     return max(LEAST_WINDOW_PX, round(WINDOW * depth.shape[1]))

@@ -34,8 +34,9 @@ def align_estimate(
             mean disparity, in words.
 
     Raises:
-        Degenerate: There are fewer than 4 known pixels, the estimate is constant there, or it falls where the disparity
-            grows.
+        Degenerate: There are fewer than 4 known pixels, the estimate is constant there or falls where the disparity
+            grows, or the bilateral solver does not converge.
+        ValueError: The estimate is not finite at a known pixel, or shapes differ.
     """
     fitted = alignment.align(estimate, view.disparity, view.known, robust=settings.robust)
     if fitted.scale <= 0:
@@ -75,7 +76,7 @@ def align_depth_map(
         description: The method, in words.
 
     Raises:
-        Degenerate, ValueError: As `alignment.align_either`.
+        Degenerate, ValueError: As `alignment.align_either` and, if it is used, the continuation.
     """
     aligned, space = alignment.align_either(depth, view.depth, view.known)
     missing = ~np.isfinite(aligned)

@@ -10,7 +10,7 @@ def inpaint_depth(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return [H, W], the depth map with its unknown pixels filled by Telea's method, which acts on disparity here.
 
     Known pixels keep their depth. At other pixels the result is 0 where the depth would be more than 1000 times the
-    smallest known depth.
+    smallest known depth, or if no pixel is known.
 
     Args:
         depth: [H, W] > 0, read where `known`.

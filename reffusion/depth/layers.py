@@ -47,7 +47,7 @@ def label_surfaces(
 
     Args:
         disparity: [H, W], read where `known`.
-        known: bool [H, W], True at the pixels around or inside the hole from which surfaces are continued.
+        known: bool [H, W], True at the pixels around or inside the hole that surfaces are continued from, at least one.
         hole: bool [H, W], True at the pixels to label, including any gap between the hole and the known pixels.
         guide: [H, W, 3] picture, uint8 or in [0, 1].
         planes: Depth [H, W] of each plane around the hole, inf where the plane is absent.
@@ -154,6 +154,7 @@ def surfaces_on_planes(
 
 
 def _at(values: np.ndarray, domain: np.ndarray) -> np.ndarray:
+    """Return the values [P, ...] at the P pixels of `domain`, bool [H, W], in row-major order."""
     return values[domain]
 
 
@@ -184,7 +185,7 @@ def segment_surfaces(
 
     Args:
         disparity: [H, W], read where `known`.
-        known: bool [H, W].
+        known: bool [H, W], with at least one True pixel.
         planes: Depth [H, W] of each plane, inf where the plane is absent.
         hole: bool [H, W]. If None, objects in front are not separated.
 

@@ -20,7 +20,7 @@ from reffusion.weights import local
 # Of the pixels of ImageNet, on which the backbone was trained.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 MODEL_TYPE = "depth_anything"
-MAX_DEPTH_M = 1e6  # metres: the depth of a metric network is clamped here before it is inverted
+MAX_DEPTH_M = 1e6  # meters: the depth of a metric network is clamped here before it is inverted
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class DepthNetwork:
         model: DepthAnythingForDepthEstimation of transformers.
         patch: Side of a patch in pixels. The network's input consists of whole patches.
         side: Side of the square training pictures in pixels.
-        metric: True if the network's output is depth in metres, False if it is disparity up to scale and offset.
+        metric: True if the network's output is depth in meters, False if it is disparity up to scale and offset.
     """
 
     model: nn.Module
@@ -81,6 +81,7 @@ def _load_or_explain(folder: Path, advice: str, load: Callable[[], Any]) -> Any:
 
 
 def _check_kind(config, name: str) -> None:
+    """Raise ValueError, which names the model, if a configuration of transformers is not for Depth Anything."""
     if config.model_type != MODEL_TYPE:
         raise ValueError(
             f"depth model {name}: a model of type {config.model_type!r}; those of type {MODEL_TYPE!r} are understood "
@@ -105,7 +106,7 @@ def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
 def predict_disparity(network: DepthNetwork, image: Tensor) -> Tensor:
     """Return the disparity of a picture up to scale and offset, [H, W] float32, on the picture's device.
 
-    The output of a metric network is inverted.
+    The output of a metric network is inverted, which gives disparity in 1 / meters.
 
     Args:
         network: The depth network.
@@ -128,7 +129,7 @@ def predict_disparity(network: DepthNetwork, image: Tensor) -> Tensor:
 
 
 def preprocess(network: DepthNetwork, image: Tensor) -> Tensor:
-    """Return the network's input for a picture: resized to whole patches and normalised, [1, 3, h, w].
+    """Return the network's input for a picture: resized to whole patches and normalized, [1, 3, h, w].
 
     The picture is scaled so that one of its sides has about the size of the training pictures: the side that needs less
     scaling. Both sides are then rounded to whole patches, which changes the aspect ratio slightly.

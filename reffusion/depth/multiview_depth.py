@@ -56,7 +56,7 @@ def estimate_multiview_depth(
     hidden: Mapping[str, np.ndarray],
     seed: int,
 ) -> dict[str, MultiviewDepth]:
-    """Return the depth of each view in which enough sparse points are visible, by the view's name.
+    """Estimate the depth of each view in which enough sparse points are visible.
 
     Args:
         points: The scene's sparse points with normals.
@@ -64,6 +64,9 @@ def estimate_multiview_depth(
         images: View name -> photograph, uint8 [H, W, 3]. All have the same exposure.
         hidden: View name -> bool [H, W], True at pixels that are never confirmed. A view without an entry has none.
         seed: Seed of PatchMatch.
+
+    Returns:
+        View name -> depth. Views with fewer than `sparse_to_dense.MIN_POINTS` visible points have no entry.
     """
     samples = {camera.name: visible_samples(points, camera, images[camera.name]) for camera in cameras}
     interpolate = lambda camera: interpolate_depth(samples[camera.name], camera, images[camera.name])
@@ -105,6 +108,7 @@ def _refine_planes(
 
 
 def _depth_of_planes(planes: np.ndarray, view: Camera) -> np.ndarray:
+    """Return [H, W] camera z, the depth at which each pixel's ray meets its plane, [H, W, 3]."""
     return 1 / (planes * geometry.pixel_rays(view)).sum(-1)
 
 
@@ -129,13 +133,13 @@ def _refuted_pixels(
 def _compare_views(
     view: Camera, depth: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], views: Sequence[Camera]
 ):
-    """Project the pixels of a view into each other view, and yield four arrays [H, W] for each other view."""
+    """Yield, for each other view, four arrays [H, W] about the places where a view's surface points project to."""
     points = geometry.unproject(depth[view.name], view)
     for other in views:
         if other.name != view.name:
             uv, z = geometry.project(points, other)
             other_depth, inside = geometry.sample_nearest(depth[other.name], uv)
-            # Yield the other view's depth where a pixel's surface point projects to, the depth of the point in the
+            # They are the other view's depth where a pixel's surface point projects to, the depth of the point in the
             # other view, whether the point is in its frame, and its `values` where the point projects to.
             yield other_depth, z, inside & (z > 0), geometry.sample_nearest(values[other.name], uv)[0]
 

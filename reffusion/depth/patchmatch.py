@@ -1,7 +1,7 @@
 """PatchMatch stereo in compiled code. It finds the plane at each pixel of a photograph that matches other views best.
 
 A plane maps a window around the pixel to windows in the other views (slanted support windows, Bleyer, Rhemann, Rother
-2011; several views, Galliani, Lasinger, Schindler 2015). The windows are compared by bilaterally weighted normalised
+2011; several views, Galliani, Lasinger, Schindler 2015). The windows are compared by bilaterally weighted normalized
 cross-correlation (Schönberger et al. 2016). A plane is a vector [3] of its coefficients in disparity: plane . (x, y, 1)
 = 1/z, the disparity at which the ray (x, y, 1) of a pixel meets the plane, in camera axes.
 """
@@ -26,7 +26,7 @@ WINDOW_HALF, WINDOW_STRIDE = (
     2,
 )  # half side of a window and spacing of its samples, in px of a picture `REFERENCE_WIDTH` wide
 COLOR_SCALE, DISTANCE_SCALE = 36.0, 8.0  # levels (sum of three channels) and px at which a sample's weight is 1/e
-MIN_DEVIATION = 2.0  # levels of 255, regularises the correlation of windows with less contrast
+MIN_DEVIATION = 2.0  # levels of 255, regularizes the correlation of windows with less contrast
 # The cost of leaving the initial depth, and the relative difference in disparity at which it reaches this value.
 PRIOR_COST, PRIOR_TOLERANCE = 0.1, 0.02
 DISPARITY_CHANGE, SLOPE_CHANGE = (
@@ -58,7 +58,7 @@ def estimate_planes(
     Args:
         camera: The camera of the photograph.
         image: uint8 [H, W, 3], the photograph.
-        others: At least one other camera with its photograph.
+        others: At least one other camera with its photograph, uint8 of its own size.
         initial: [H, W] camera z > 0. A plane pays a cost for leaving this depth, so the initial depth is kept where the
             photographs do not determine the depth.
         generator: Draws the random changes of planes.

@@ -21,7 +21,7 @@ def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     Args:
         disparity: [H, W], read where the weight is positive.
-        weights: [H, W] >= 0.
+        weights: [H, W] >= 0, with at least one positive value.
     """
     rows, columns = np.nonzero(weights > 0)
     width = disparity.shape[1]

@@ -44,7 +44,7 @@ class SolverLog:
                 self.log.log(iteration, series=f"bilateral {self.view}", residual=residual, **self._error(result))
 
     def log_result(self, solver: str, result: np.ndarray, iterations: int = 1) -> None:
-        """Log the error of the final result of a solver.
+        """Log the error of the final result of a solver, in a line that ends the series by the reason "converged".
 
         Args:
             solver: The name of the solver, which becomes a part of the name of the series.
@@ -57,6 +57,7 @@ class SolverLog:
                 self.log.log(iterations, series=f"{solver} {self.view}", **self._error(result), **end)
 
     def _error(self, result: np.ndarray) -> dict[str, float]:
+        """Return the entry "disparity_error" of a disparity map [H, W]; empty without points."""
         sampled, _ = geometry.sample_nearest(result, self.pixels)
         relative = sampled / self.values - 1
         return {"disparity_error": float(np.sqrt(np.mean(relative**2)))} if len(relative) else {}

@@ -99,7 +99,7 @@ def visible_samples(points: SparsePoints, camera: Camera, image: np.ndarray) -> 
     """Return the sparse points that are visible in a photograph, as samples of its depth.
 
     A visible point lies in the photograph's frame, is not behind most of the points around it, and has about the color
-    of the photograph at its pixel.
+    of the photograph at its pixel. If at most `OCCLUSION_NEIGHBORS` points lie in the frame, all of them are returned.
 
     Args:
         points: The scene's sparse points.

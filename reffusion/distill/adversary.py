@@ -45,6 +45,7 @@ class Adversary:
 
         Raises:
             FloatingPointError: The loss or its gradient is not finite. The critic's weights are unchanged.
+            ValueError: The number of patches is not a multiple of 4.
         """
         patches = {"real": real.detach(), "fake": fake.detach()}
         side = self.choices.penalized
@@ -80,5 +81,6 @@ class Adversary:
         return {"critic": self.critic.state_dict(), "optimizer": self._optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore critic and optimizer from what `state_dict` returned."""
         self.critic.load_state_dict(state["critic"])
         self._optimizer.load_state_dict(state["optimizer"])

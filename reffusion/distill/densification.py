@@ -27,7 +27,7 @@ def densify_masked(
             reset.
         started_with: Number of masked Gaussians at the start of the distillation, which bounds their growth.
         settings: The threshold and the bound.
-        size_unit: The unit of sizes, in the normalised frame.
+        size_unit: The unit of sizes, in the normalized frame.
         generator: Draws the positions of split Gaussians.
     """
     masked = int(optimizer.masked.sum())

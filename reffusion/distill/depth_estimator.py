@@ -21,8 +21,8 @@ class DepthEstimator(NamedTuple):
     Attributes:
         how: Settings of the estimate, which also determine at which pixels the rendered depth counts as known.
         disparity: Function of a `ViewDepth` and of a function without arguments. It returns the disparity [H, W], 1 /
-            camera z in the normalised frame. The second argument returns the view with its hole repainted, [H, W, 3] in
-            [0, 1]. This function runs the diffusion prior, so it is called only if the picture is needed. The estimator
+            camera z in the normalized frame. The second argument returns the view with its hole repainted, [H, W, 3] in
+            [0, 1]. It runs the diffusion prior, so the estimator calls it only if the picture is needed. The estimator
             raises Degenerate if the view does not determine the disparity.
     """
 

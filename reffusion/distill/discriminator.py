@@ -1,10 +1,10 @@
 """The patch critic of the adversarial term (RefFusion section 4.3): StyleGAN2's residual discriminator and its losses.
 
 The losses are written with f(x) = -log(1 + exp(-x)), the logarithm of the logistic function, and with the critic's
-score D of a patch, which is high if the critic takes the patch for real. The critic maximises f(D(real)) + f(-D(fake)).
-The generator, here the Gaussians, minimises it.
+score D of a patch, which is high if the critic takes the patch for real. The critic maximizes f(D(real)) + f(-D(fake)).
+The generator, here the Gaussians, minimizes it.
 
-PAPER leaves open: details of the discriminator beyond StyleGAN2's name. We take its residual form, equalised learning
+PAPER leaves open: details of the discriminator beyond StyleGAN2's name. We take its residual form, equalized learning
 rates, the anti-aliasing filter [1, 3, 3, 1] before each downsampling, and the minibatch standard deviation over groups
 of 4.
 """
@@ -28,7 +28,7 @@ GROUP = 4  # patches in a group of the minibatch standard deviation
 
 
 class Convolution(nn.Module):
-    """A square convolution with equalised learning rate.
+    """A square convolution with equalized learning rate.
 
     Its weights are standard normal at first, and are divided by sqrt(fan-in) when they are used. So the weights of all
     layers have the same scale, and an optimizer step changes all layers by the same proportion.
@@ -41,11 +41,12 @@ class Convolution(nn.Module):
         self.scale, self.stride, self.padding = 1 / sqrt(inputs * side**2), stride, padding
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the convolution, with bias, of `x` [B, inputs, H, W]."""
         return F.conv2d(x, self.weight * self.scale, self.bias, stride=self.stride, padding=self.padding)
 
 
 class Linear(nn.Module):
-    """A linear layer with equalised learning rate, like `Convolution`."""
+    """A linear layer with equalized learning rate, like `Convolution`."""
 
     def __init__(self, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
@@ -54,6 +55,7 @@ class Linear(nn.Module):
         self.scale = 1 / sqrt(inputs)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the layer's outputs [B, outputs] for `x` [B, inputs]."""
         return F.linear(x, self.weight * self.scale, self.bias)
 
 
@@ -69,6 +71,7 @@ class DownBlock(nn.Module):
         self.register_buffer("halve", binomial_filter(size, padding=1)[::2].contiguous(), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the sum of the filtered branch and the skip branch at half the size, divided by sqrt(2)."""
         deep = self.smooth @ scaled_leaky_relu(self.first(x)) @ self.smooth.T
         return (scaled_leaky_relu(self.second(deep)) + self.skip(self.halve @ x @ self.halve.T)) / sqrt(2)
 
@@ -100,6 +103,7 @@ class Critic(nn.Module):
         self.score = Linear(channels[-1], 1, generator)
 
     def forward(self, patches: Tensor) -> Tensor:
+        """Return the scores [B] of `patches` [B, 3, size, size] in [-1, 1]; B is a multiple of 4."""
         x = scaled_leaky_relu(self.colors(patches))
         for halving in self.halvings:
             x = halving(x)
@@ -132,7 +136,7 @@ def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
     """Append the minibatch standard deviation as a channel: [B, C, h, w] -> [B, C + 1, h, w].
 
     The channel is constant within a group of patches. Its value is the standard deviation over the group, averaged over
-    channels and pixels. By this value the critic recognises fake patches that are too similar to each other. A group
+    channels and pixels. By this value the critic recognizes fake patches that are too similar to each other. A group
     consists of every (B / group)-th patch, so consecutive patches are in different groups (if B > group).
 
     Args:
@@ -152,9 +156,7 @@ def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
 
 
 def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
-    """Return the loss of the critic, -mean f(D(real)) - mean f(-D(fake)).
-
-    It is finite for all finite scores.
+    """Return the loss of the critic, -mean f(D(real)) - mean f(-D(fake)), which is finite for all finite scores.
 
     Args:
         real, fake: Scores of real and of fake patches, of any shape.
@@ -163,11 +165,11 @@ def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
-    """Return the loss that the generator minimises.
+    """Return the loss that the generator minimizes.
 
-    The paper prints "saturating", mean f(-D(fake)): it is the critic's own objective, whose gradient
-    vanishes where the critic is certain that a patch is fake. "non-saturating", -mean f(D(fake)), has the same fixed
-    point, and its gradient is largest there.
+    The paper prints "saturating", mean f(-D(fake)): the critic's own objective, whose gradient vanishes where the
+    critic is certain that a patch is fake. "non-saturating", -mean f(D(fake)), has the same fixed point, and its
+    gradient is largest where the critic is certain.
 
     Args:
         fake: Scores of fake patches, of any shape.
@@ -188,7 +190,7 @@ def gradient_penalty(scores: Tensor, patches: Tensor) -> Tensor:
 
     Args:
         scores: [B], the critic's scores of `patches`.
-        patches: [B, 3, n, n], requiring a gradient.
+        patches: [B, 3, n, n] with requires_grad, from which `scores` were computed.
     """
     (slope,) = torch.autograd.grad(scores.sum(), patches, create_graph=True)
     return slope.square().flatten(1).sum(1).mean()

@@ -18,6 +18,8 @@ def clamp_to_display(color: Tensor) -> Tensor:
 
 
 class _ClampToDisplay(torch.autograd.Function):
+    """Autograd function of `clamp_to_display`."""
+
     @staticmethod
     def forward(ctx, color: Tensor) -> Tensor:
         ctx.save_for_backward(color)

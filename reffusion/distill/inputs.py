@@ -44,7 +44,7 @@ def load_initialization(
 
 
 def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | None, Tensor | None]:
-    """Load the personalized prior without its text encoder, and the embeddings of the prompts.
+    """Load the prior, personalized if a LoRA is given, without its text encoder, and the embeddings of the prompts.
 
     Args:
         params: Parameters of the stage `distill`.

@@ -50,7 +50,7 @@ REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 @dataclass(frozen=True)
 class Objective:
-    """The weighted sum of terms that the distillation minimises.
+    """The weighted sum of terms that the distillation minimizes.
 
     Attributes:
         terms: The terms that are on, in the order in which their gradients are added.
@@ -83,7 +83,7 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
 def distill(
     initial: Gaussians, masked: Tensor, inputs: TermInputs, settings: Params, folder: Path, rates: Rates | None = None
 ) -> tuple[Gaussians, Tensor]:
-    """Optimise an initialization, from the start or from the checkpoint in `folder`.
+    """Optimize an initialization, from the start or from the checkpoint in `folder`.
 
     On the CPU a resumed run ends with the same bits as an unbroken one. A line of the trace contains: reconstruction
     and lift (the values of these terms), reference_psnr (in the holes of the references), sds_gradient_mean and
@@ -102,8 +102,8 @@ def distill(
             Gaussians are multiplied by the factors in `settings.lr` (`masked_factors`).
 
     Returns:
-        The optimised Gaussians, detached, and their labels, bool [M]. M differs from N if Gaussians were densified or
-            pruned.
+        The optimized Gaussians, detached, and their labels, bool [M]. M differs from N if Gaussians were densified or
+            pruned. Without densification the Gaussians are the mean over the last third of the run (see `average`).
 
     Raises:
         FloatingPointError: A value or a gradient is not finite. The message names step, term and view.
@@ -209,6 +209,7 @@ def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -
 
 
 def _backward(loss: Tensor, gaussians: Gaussians) -> None:
+    """Add the loss's gradient to `.grad`. Raises FloatingPointError if the loss or a gradient is not finite."""
     if not torch.isfinite(loss):
         raise FloatingPointError(f"the loss is {float(loss.detach())}")
     loss.backward()
@@ -238,6 +239,7 @@ def _gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:
 
 
 def _densifies_after(settings: Params, done: int) -> bool:
+    """Return whether the Gaussians are densified after `done` steps."""
     every, last = settings.densify.every, DENSIFIED_UNTIL * settings.iterations
     return bool(every) and done % every == 0 and done <= last
 
@@ -245,7 +247,7 @@ def _densifies_after(settings: Params, done: int) -> bool:
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
     """Average the Gaussians over the steps after the share `AVERAGED_FROM` of a run.
 
-    This is called after each step, and adds its Gaussians to the running mean. After the last step the mean replaces
+    Call this function after each step: it adds the Gaussians to the running mean. After the last step the mean replaces
     the Gaussians. A run with densification is not averaged.
 
     Args:
@@ -295,7 +297,8 @@ class _Run:
         """Return a run at its start, or at a checkpoint.
 
         Args:
-            state: The state in the checkpoint (see `state_dict`). None starts a new run.
+            state: The state in the checkpoint (see `state_dict`), which is restored into `optimizer` and the terms of
+                `objective`. None starts a new run.
         """
         run = cls(optimizer, objective)
         if state is not None:
@@ -308,6 +311,7 @@ class _Run:
         return run
 
     def state_dict(self) -> dict[str, Any]:
+        """Return the state from which `start_or_resume` continues."""
         return {
             "optimizer": self.optimizer.state_dict(),
             "terms": {t.name: t.state.state_dict() for t in self.objective.terms if t.state is not None},

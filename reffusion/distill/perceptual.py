@@ -40,8 +40,8 @@ def load(device: str = "cpu") -> tuple[str, Distance]:
 def multi_scale_dssim(render: Tensor, target: Tensor) -> Tensor:
     """Return the mean of 1 - SSIM at full, half and quarter size, differentiable in `render`.
 
-    It replaces LPIPS. Both tolerate a slight blur of coarse structure, but unlike LPIPS this distance does not
-    recognise textures. Sizes at which a side is shorter than SSIM's window of 11 px are left out.
+    This distance replaces LPIPS. Both tolerate a slight blur of coarse structure, but this distance does not recognize
+    textures. Sizes at which a side is shorter than SSIM's window of 11 px are left out.
 
     Args:
         render, target: [H, W, 3] in [0, 1].

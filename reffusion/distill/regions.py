@@ -43,8 +43,8 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
         means: [N, 3], the centers of all Gaussians of the initialization.
         masked: bool [N], True for masked Gaussians, of which there is at least one.
         resolution: Number of voxels along the diagonal of the bounding box of the masked Gaussians.
-        reach: Number of voxels along each axis by which a masked Gaussian may be away from the masked Gaussians of the
-            initialization.
+        reach: Number of voxels along each axis by which a masked Gaussian may later be away from the nearest masked
+            Gaussian of the initialization.
     """
     masked_means = means[masked]
     low, high = masked_means.amin(0), masked_means.amax(0)

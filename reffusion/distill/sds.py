@@ -18,7 +18,7 @@ Denoiser = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (z_t [B, C, h, w
 
 
 def draw_timesteps(count: int, steps: int, low: float, high: float, generator: torch.Generator) -> Tensor:
-    """Draw timesteps uniformly from a part of the noise schedule, long [count].
+    """Draw timesteps uniformly from a part of the noise schedule, long [count] on the CPU.
 
     Args:
         count: Number of timesteps to draw.
@@ -51,7 +51,7 @@ def match_contrast(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
 
     A denoiser predicts the mean of all plausible images, which has less contrast than any of them. Repeated steps
     towards this mean remove contrast from a rendering that was correct. So for each sample and channel, the deviations
-    x0' from the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>. This factor minimises the squared
+    x0' from the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>. This factor minimizes the squared
     difference from the deviations z' of the latents. A factor below 1 is replaced by 1, so that x0 may add contrast.
     With a factor above 1, |b x0'| <= |z'|, so the contrast never exceeds that of the latents. The elements outside the
     mask are multiplied by the same factor.
@@ -83,7 +83,7 @@ def sds_gradient(
 ) -> Tensor:
     """Return the SDS gradient w(t) (eps_theta(z_t, t) - eps), without the UNet's Jacobian (DreamFusion eq. 3).
 
-    PAPER leaves open: w(t), and any normalisation (none here). Equation 2 has the factor dz_t/dz = a, which libraries
+    PAPER leaves open: w(t), and any normalization (none here). Equation 2 has the factor dz_t/dz = a, which libraries
     omit; it is part of w here. Since eps_theta - eps = (a / s) (z - x0_theta), the weightings differ only by a function
     of t:
       "sigma2"  s^2 (eps_theta - eps), as in DreamFusion and threestudio;

@@ -19,10 +19,10 @@ class TrainView:
         camera: The camera of the view.
         photo: [H, W, 3], uint8 (a quarter of the memory of float32, with hundreds of views) or float32 in [0, 1].
         supervises: bool [H, W], True at pixels whose photograph may supervise: outside the consistent mask C (the
-            object), outside the invent mask I (the pixels to invent) and outside the object's shadow. In a clean view
-            all pixels outside the shadow may supervise. In a view without a photograph no pixel may.
+            object), the invent mask I (the pixels to invent), the object's shadow and the pixels that the scene
+            ignores. In a clean view C and I do not matter. In a view without a photograph no pixel may supervise.
         repaint: bool [H, W], True in the hole: the pixels that are invented and that the UNet repaints. It is all False
-            if the view is not distilled.
+            if the view is not distilled, such as a clean view.
         clean: True if the object is absent from this view.
         lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D by the stage `lift`; None if there is no such
             image.

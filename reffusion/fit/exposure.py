@@ -1,8 +1,8 @@
-"""Exposure compensation: an affine color map for each view, optimised with the scene (as in the code of 3DGS).
+"""Exposure compensation: an affine color map for each view, optimized with the scene (as in the code of 3DGS).
 
 A phone changes its exposure while it moves around a scene. Without compensation Gaussians learn the mean of the
 exposures, or colors that change with the viewing direction. With compensation all Gaussians have one exposure, and
-later stages use photographs normalised to this exposure. A view without a photograph takes an average of the exposures
+later stages use photographs normalized to this exposure. A view without a photograph takes an average of the exposures
 of nearby photographs.
 
 The *exposure* of a view is an affine map [3, 4] from the colors of the Gaussians to the colors of the photograph:
@@ -47,7 +47,7 @@ _IDENTITY = torch.eye(3, 4)
 
 
 class Exposures:
-    """The exposures of V views, and the Adam optimiser that fits them together with the Gaussians.
+    """The exposures of V views, and the Adam optimizer that fits them together with the Gaussians.
 
     Each view has a matrix [3, 4]: photo = matrix[:, :3] @ color + matrix[:, 3]. Multiplying all matrices by one
     matrix, and all colors by the inverse of this matrix, leaves the pictures unchanged. So the mean of the matrices is
@@ -72,16 +72,13 @@ class Exposures:
         self._adam = torch.optim.Adam(list(self._matrices.values()), lr=LEARNING_RATE, eps=1e-15)
 
     def apply(self, color: Tensor, name: str) -> Tensor:
-        """Return the colors [H, W, 3] with the exposure of view `name` applied.
-
-        Differentiable in the colors and in the exposure. The result is not clamped.
-        """
+        """Return colors [H, W, 3] with the exposure of view `name` applied, not clamped; differentiable in both."""
         matrix = self._matrices[name]
         return color @ matrix[:, :3].T + matrix[:, 3]
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
-        """Do one Adam step for the exposures that have a gradient, then shift all so that their mean is the identity.
+        """Take one Adam step for the exposures that have a gradient, then shift all so that their mean is the identity.
 
         The gradients are cleared.
 
@@ -126,7 +123,7 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
         cameras: the cameras of all views, including the views with a fitted exposure.
 
     Returns:
-        View name -> exposure [3, 4] float64. Empty if no exposures were fitted.
+        View name -> exposure [3, 4] float64. Empty if no exposures were fitted for any of `cameras`.
     """
     path = Path(fit) / FILE
     fitted = {name: np.array(matrix) for name, matrix in load_json(path).items()} if path.exists() else {}
@@ -150,7 +147,7 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
 
 def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -> np.ndarray:
     """Return the distances [V, K] between the poses of V views and of K fitted cameras."""
-    # The distance is the length of a vector of six numbers: the difference of the two camera centers (normalised frame)
+    # The distance is the length of a vector of six numbers: the difference of the two camera centers (normalized frame)
     # and the difference of the two unit viewing directions, with equal weight.
     features = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
     return np.linalg.norm(features(views)[:, None] - features(fitted_cameras)[None], axis=-1)
@@ -158,13 +155,13 @@ def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -
 
 def _kernel_weights(distances: np.ndarray) -> np.ndarray:
     """Return Gaussian kernel weights [V, K] for distances [V, K] in units of the bandwidth; they sum to 1 over K."""
-    # Subtracting the smallest square changes no normalised weight, and keeps the weights from all becoming 0.
+    # Subtracting the smallest square changes no normalized weight, and keeps the weights from all becoming 0.
     weights = np.exp(-(distances**2 - np.square(distances.min(1, keepdims=True))) / 2)
     return weights / weights.sum(1, keepdims=True)
 
 
 def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
-    """Return the colors [H, W, 3] of rendered Gaussians with an exposure [3, 4] applied, not clamped.
+    """Return the colors of rendered Gaussians with an exposure applied, [H, W, 3], not clamped.
 
     Args:
         color: [H, W, 3] in [0, 1].
@@ -234,6 +231,9 @@ def load_photos_in_scene_exposure(poses: Path, fit: Path, names: Iterable[str]) 
 
     Returns:
         View name -> uint8 [H, W, 3], in the order of `names`.
+
+    Raises:
+        ValueError: as `normalize_exposure`.
     """
     names = list(names)
     photographed = [name for name in names if has_photograph(poses, name)]
@@ -248,7 +248,7 @@ def load_photos_in_scene_exposure(poses: Path, fit: Path, names: Iterable[str]) 
 def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Render the named views from the Gaussians that the stage `fit` wrote, object included, on the CPU.
 
-    The exposures of the views are not applied.
+    The exposures of the views are not applied. Without names no file is read.
 
     Args:
         poses, fit: folders of the stages of these names.
@@ -293,6 +293,6 @@ def undo_exposure(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
 
     Args:
         color: [H, W, 3] in [0, 1].
-        matrix: [3, 4]; None returns the colors unchanged.
+        matrix: [3, 4], whose first three columns are invertible; None returns the colors unchanged.
     """
     return color if matrix is None else (color - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T

@@ -83,13 +83,13 @@ def gaussians_on_surfaces(
 def is_beside_nearer(depth: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
 
-    The color of the nearer surface bleeds into these pixels. A pixel next to it is one whose depth exceeds
-    `OCCLUSION_RATIO` times the smallest depth in the 3 x 3 pixels around it.
+    The color of the nearer surface bleeds into these pixels. Their depth exceeds `OCCLUSION_RATIO` times the smallest
+    depth among the 3 x 3 pixels around them.
     """
     return depth > OCCLUSION_RATIO * ndimage.minimum_filter(depth, NEIGHBORHOOD_PX)
 
 
 def shorten_schedule(params: Params) -> Params:
-    """Return the parameters of a fit that starts on surfaces: `STEPS_SHARE` of the steps, and no densification."""
+    """Return the parameters of a fit that starts on surfaces: `STEPS_SHARE` of the steps, no density control."""
     steps = max(1, round(STEPS_SHARE * params.iterations))
     return params.changed({"iterations": steps, "densify.stop": 0.0, "densify.start": 0.0, "densify.reset_every": 0.0})

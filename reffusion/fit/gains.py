@@ -21,7 +21,7 @@ PRIOR_WEIGHT = 1e-3  # pull of a view towards the mean, in points; it decides on
 def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]) -> np.ndarray:
     """Estimate the brightness of each view's red, green and blue relative to the geometric mean of all views.
 
-    Brightness is measured in sRGB values, which are not linearised. The estimate is a robust least-squares fit to the
+    Brightness is measured in sRGB values, which are not linearized. The estimate is a robust least-squares fit to the
     logarithms of colors, with one unknown per view (its brightness) and one per point (its color). Colors that are
     too dark or clipped are left out.
 
@@ -31,7 +31,8 @@ def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mappin
         photos: view name -> uint8 [H, W, 3].
 
     Returns:
-        [V, 3] positive gains, in the order of `cameras`; 1 for a view that shares no points with another one.
+        [V, 3] positive gains, in the order of `cameras`; 1 for a view that shares no points with another one, and for
+        all views if P = 0.
     """
     points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     result = np.ones((len(cameras), 3))
@@ -53,6 +54,7 @@ def brightness_deviation(gains: np.ndarray) -> float:
 
 
 def _blur(photo: np.ndarray) -> np.ndarray:
+    """Return a photograph [H, W, 3] blurred by `BLUR` of its width, float32 in [0, 255]."""
     return cv2.GaussianBlur(photo.astype(np.float32), (0, 0), max(0.5, BLUR * photo.shape[1]))
 
 

@@ -28,7 +28,7 @@ def limit_sh_degree(params: Params, scene: Scene) -> Params:
     """Return the parameters with the degree of spherical harmonics limited to what the training views determine.
 
     A degree d has (d + 1)^2 coefficients, and at least this many training views must contain a typical sparse point.
-    With `few_views` = "as_many" the parameters are returned unchanged. A lower degree is printed.
+    With `params.few_views` = "as_many" the parameters are returned unchanged. If the degree is lowered, it is printed.
     """
     max_degree = params.sh.degree
     if params.few_views == "as_many":
@@ -98,8 +98,8 @@ def start_on_surfaces(params: Params, scene: Scene, cameras: list[Camera], image
         hidden: view name -> bool [H, W], True for pixels to be ignored.
 
     Returns:
-        The Gaussians; None if `params.few_views` is not "surfaces", if there are more than `few_views.MAX_VIEWS` views,
-        or if too few sparse points are visible.
+        The Gaussians, whose number is printed; None if `params.few_views` is not "surfaces", if there are more than
+        `few_views.MAX_VIEWS` views, or if too few sparse points are visible.
     """
     if params.few_views != "surfaces" or len(cameras) > few_views.MAX_VIEWS:
         return None
@@ -118,10 +118,10 @@ def collect_points(
 ):
     """Collect the points from which a fit starts: the sparse points, and points where pictures show more.
 
-    If `params.init.flow_cell` is not 0, points are triangulated from optical flow, and added where a view shows no
-    point (`points_for_empty_cells`). A point is left out if it projects into `hidden` in
-    more than half of those views that have such a mask and contain the point, because no supervising pixel would ever
-    move Gaussians there.
+    If `params.init.flow_cell` is not 0, all points that optical flow triangulates are added, and then further points
+    where a view shows none of them (`points_for_empty_cells`); the numbers are printed. A point is left out if it
+    projects into `hidden` in more than half of those views that have such a mask and contain the point, because no
+    supervising pixel would ever move Gaussians there.
 
     Args:
         cameras: the views between which flow is computed.
@@ -129,7 +129,7 @@ def collect_points(
         hidden: view name -> bool [H, W], True for pixels that do not supervise.
 
     Returns:
-        Positions [P, 3] float64 and colors [P, 3] uint8, sparse points first.
+        Positions [P, 3] float64 and colors [P, 3] uint8: sparse points, then those by flow, then the further points.
     """
     points, colors = scene.points, scene.point_colors
     if params.init.flow_cell:
@@ -149,7 +149,7 @@ def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Ga
     If there are more points than `params.densify.cap_max`, a random subset of this size is used.
 
     Args:
-        points: [P, 3] positions.
+        points: [P, 3] positions, P >= 4; fewer raise ValueError.
         colors: [P, 3] uint8.
     """
     generator, settings = seeding.generator(params.seed, "start"), params.init

@@ -1,4 +1,4 @@
-"""3DGS optimisation of a whole scene from its training views; pixels can be excluded by weights of 0."""
+"""3DGS optimization of a whole scene from its training views; pixels can be excluded by weights of 0."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def fit(
     impl: Implementation = "auto",
     label: str = "fit",
 ) -> Gaussians:
-    """Optimise the initial Gaussians so that their renderings match the views, and return the result.
+    """Optimize the initial Gaussians so that their renderings match the views, and return the result.
 
     If `folder` holds a checkpoint, the fit resumes from it, and ends with the same bits as without the interruption.
 
@@ -69,11 +69,11 @@ def fit(
         rates: Adam's learning rates; None takes those of `settings.lr`.
         gains: [V, 3], initial brightness of `cameras` from which exposures are fitted; None fits no exposures.
         placed: [N] bool, True for the Gaussians of `initial` whose positions are known. Their positions move with
-            `PLACED_RATE_FACTOR` times the learning rate. None: none is.
+            `PLACED_RATE_FACTOR` times the learning rate. None: all False.
         spent: seconds already spent on making `initial`; "seconds" in the trace, which is cumulative, starts from this
             value.
         impl: implementation of the renderer.
-        label: name of the optimisation in its progress bar.
+        label: name of the optimization in its progress bar.
 
     Returns:
         The Gaussians, detached. Their number differs from that of `initial` if the schedule densifies or prunes.
@@ -188,7 +188,7 @@ class _Run:
         self.loss, self.error = self.loss + loss, self.error + error
 
     def finish(self, folder: Path) -> Gaussians:
-        """Write the exposures, if any, to `folder`/exposures.json, and return the detached Gaussians."""
+        """Write the exposures, if they are fitted, to `folder`/exposures.json, and return the detached Gaussians."""
         if self.exposures is not None:
             self.exposures.save(folder)
         return self.optimizer.gaussians.map(Tensor.detach)

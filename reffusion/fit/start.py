@@ -24,7 +24,7 @@ def initial_gaussians(
     """Return the initial Gaussians of 3DGS: an isotropic one at each point, as large as the points are far apart.
 
     Args:
-        points: [P, 3] in the normalised frame, P >= 4.
+        points: [P, 3] in the normalized frame, P >= 4.
         colors: [P, 3] uint8, the colors of the Gaussians.
         sh_degree: degree of the spherical harmonics; all but the constant one are 0.
         budget: maximum number of Gaussians, at least 4; if there are more points, a random subset of them is used.

@@ -37,7 +37,7 @@ def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
     """Return Adam's learning rates for a fit to these views.
 
     The learning rate of positions decays to a hundredth of `lr.means` by the end of the fit. With `lr.means_unit` =
-    "cameras" it is in units of `cameras_extent(cameras)`, the unit of 3DGS, else in units of the normalised frame. The
+    "cameras" it is in units of `cameras_extent(cameras)`, the unit of 3DGS, else in units of the normalized frame. The
     views matter only for this unit.
     """
     rates = Rates(
@@ -62,7 +62,7 @@ def step(
     i: int,
     impl: Implementation,
 ) -> tuple[float, float]:
-    """Do one optimisation step on one view: render it, compute the loss, and update Gaussians and exposures.
+    """Take one optimization step on one view: render the view, compute the loss, and update Gaussians and exposures.
 
     As long as the schedule densifies, the screen-space gradients of the step are accumulated in `optimizer`.
 
@@ -129,7 +129,7 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 def coarse_steps(settings: Params) -> int:
     """Return the number of steps, at the start, that use views of half the size.
 
-    With a dense start positions are known. Sizes and colors are learnt first, and small views are enough for these.
+    With a dense start positions are known. Sizes and colors are learned first, and small views are enough for these.
     Without a dense start the number is 0, as in 3DGS.
     """
     return round(COARSE_SHARE * settings.iterations) if settings.init.flow_cell else 0
@@ -139,7 +139,7 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
     """Add the current Gaussians to the running mean if `is_averaged`; after the last step replace them by the mean.
 
     Args:
-        done: number of steps done.
+        done: number of steps done, this one included.
     """
     if is_averaged(settings, done):
         optimizer.remember()
@@ -172,13 +172,13 @@ def degree_at(settings: Params, i: int) -> int:
 def control_density(
     optimizer: GaussianOptimizer, cameras: Sequence[Camera], started_with: int, settings: Params, done: int
 ) -> None:
-    """Densify, prune and reset opacities (cap them at 0.01), if `settings.densify` schedules it after `done` steps.
+    """Densify, prune and reset opacities (cap them at 0.01), each if `settings.densify` schedules it after this step.
 
     Args:
-        optimizer: holds the Gaussians, which are changed.
+        optimizer: holds the Gaussians, which are replaced or changed in place.
         cameras: the training views. `settings.densify.size_unit` is measured from them.
         started_with: number of Gaussians at the start of the fit.
-        done: number of steps done.
+        done: number of steps done, this one included.
     """
     schedule, progress = settings.densify, done / settings.iterations
     if not schedule.start < progress < schedule.stop:
@@ -197,7 +197,7 @@ def control_density(
 
 
 def _size_unit(means: Tensor, cameras: Sequence[Camera], schedule: Densify) -> Tensor | float:
-    """Return the unit of sizes: one for all Gaussians, or [N]."""
+    """Return the unit of sizes: the extent of the cameras, or the viewing distance of each Gaussian, [N]."""
     if schedule.size_unit == "cameras":
         return cameras_extent(cameras)
     return viewing_distance(means, torch.tensor(np.stack([each.center for each in cameras]), dtype=torch.float32))

@@ -26,18 +26,19 @@ MAX_WITNESSES = 24  # number of views that are asked, so that time grows linearl
 def points_for_empty_cells(
     cameras: Sequence[Camera], images: Mapping[str, np.ndarray], points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Add a point for each cell of a view that shows no point.
+    """Return new points for the cells of each view that show no point and are `REACH` or more cells from one that does.
 
-    Its depth is that of the nearest cell that shows one, times powers of `FARTHER` until none of `MAX_WITNESSES` views
-    sees past the point; a point beyond `FARTHEST` is moved to this depth.
+    A new point has the smoothed depth of the nearest cell that shows a point, times powers of `FARTHER` until none of
+    `MAX_WITNESSES` views sees past it; the depth is limited to `FARTHEST`. New points count as shown in later views. A
+    view that shows no point at all gets none.
 
     Args:
-        cameras: the views, in the normalised frame.
+        cameras: the views, in the normalized frame.
         images: view name -> uint8 [H, W, 3].
         points: [P, 3], the points that matches have placed.
 
     Returns:
-        The added points [A, 3] float64 and their colors [A, 3] uint8.
+        The new points [A, 3] float64 and their colors [A, 3] uint8, without `points`.
     """
     witnesses = cameras[:: -(-len(cameras) // MAX_WITNESSES)]
     seen = {camera.name: depth_of_cells(camera, points, CELL) for camera in cameras}
@@ -64,7 +65,7 @@ def points_for_empty_cells(
 
 
 def _is_seen_past(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return bool [P], True for points in front of what a view shows in their cell, by its depth of cells in `seen`."""
+    """Return bool [P], True for points clearly in front of what a camera shows in their cell (its depth in `seen`)."""
     past = np.zeros(len(points), bool)
     for camera in cameras:
         cells, depth = locate_cells(camera, points, CELL)

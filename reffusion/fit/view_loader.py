@@ -32,7 +32,7 @@ def iterate_views(
         cameras: the views.
         images: view name -> uint8 [H, W, 3].
         weights: view name -> [H, W], weights of the pixels; a view without an entry has none.
-        steps: the numbers of the steps; a resumed fit does not begin at 0.
+        steps: the numbers of the steps, with stride 1; a resumed fit does not begin at 0.
         seed: seed of the order of the views.
         coarse: number of the first step that gets full views; all steps before it get views of half the size.
         device: the device of the tensors.

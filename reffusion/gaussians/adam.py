@@ -66,7 +66,7 @@ def fastest(device: torch.device) -> Callable[..., None]:
 
 @torch.no_grad()
 def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """Do one Adam step on the visible Gaussians: update their parameters and moments in place.
+    """Take one Adam step on the visible Gaussians: update their parameters and moments in place.
 
     Args:
         updates: the parameters with their moments, gradients and learning rates.
@@ -90,7 +90,7 @@ def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1,
 
 
 def adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """Do the step of `adam` in one pass over memory, for float32 on the CPU; arguments as for `adam`."""
+    """Take the step of `adam` in one pass over memory, for float32 on the CPU; arguments as for `adam`."""
     if not updates:
         return
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
@@ -117,7 +117,7 @@ def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors
 
 @_jit
 def _adam_rows(begin, end, tables, rates, masked_factor, rows, numbers):
-    """Update the Gaussians `begin` to `end` - 1 of one parameter; `tables` holds it, its moments and its gradient."""
+    """Update rows `begin` to `end` - 1 of a parameter; `tables` holds the parameter, its moments and its gradient."""
     parameter, first, second, gradient = tables
     steps, visible, masked, unbias1, unbias2 = rows
     beta1, beta2, epsilon = numbers

@@ -22,7 +22,7 @@ _BLOCK = 1024  # elements per program of a kernel
 
 
 def works() -> bool:
-    """Return whether the kernels can be compiled and run on the GPU of this machine. If not, the reason is printed."""
+    """Return whether the kernels can be compiled and run on this machine's GPU. If not, the reason goes to stderr."""
     try:
         probe = torch.zeros(4, 4, 1, device="cuda")
         dssim_and_gradient(probe, probe, None, np.ones(1), (1.0, 1.0))
@@ -54,7 +54,7 @@ def dssim_and_gradient(
 
     Args:
         image, target: [H, W, C] float32 in [0, 1].
-        weights: [H, W] float32, or None for weights of 1.
+        weights: [H, W] float32, or None for weights of 1. Pixels of weight 0 must be finite.
         window: [2 R + 1], the taps of the window along one axis.
         constants: C1 and C2 of SSIM.
 
@@ -189,7 +189,7 @@ def _gathered_down_columns(
 
 @torch.no_grad()
 def adam(updates, steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """Do the step of `gaussians.adam.adam` in one pass over memory; arguments as there."""
+    """Take the step of `gaussians.adam.adam` in one pass over memory; arguments as there."""
     for parameter, first, second, gradient, rates, masked_factor in updates:
         count, wide = parameter.numel(), parameter.shape[1]
         tables = parameter, first, second, gradient.contiguous(), rates.to(parameter)

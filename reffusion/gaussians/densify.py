@@ -1,6 +1,6 @@
 """Adaptive density control of 3DGS: clone or split Gaussians with large screen-space gradients, prune faint ones.
 
-All lengths are in units of the normalised frame, in which cameras are about 1 from the scene.
+All lengths are in units of the normalized frame, in which cameras are about 1 from the scene.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ def densify(
     """Clone small and split large Gaussians whose mean screen-space gradient is at least `grow_grad2d`.
 
     The mean screen-space gradient is the mean of the gradient's norm over the views that `GaussianOptimizer.observe`
-    accumulated. The accumulated gradients are reset. A clone is a copy at the same position. It moves away from the
-    original, because its Adam moments start at zero. A split replaces a Gaussian by two smaller children at positions
-    sampled from it. Clones and children inherit the label.
+    accumulated. The accumulated gradients are reset. A clone is a copy at the same position; later steps move the clone
+    away from the original, because its Adam moments start at zero. A split replaces a Gaussian by two smaller children
+    at positions sampled from it. Clones and children inherit the label.
 
     Args:
-        optimizer: holds the Gaussians, which are replaced. The survivors come first, in their order, then clones, then
-            children.
-        grow_grad2d: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
+        optimizer: holds the Gaussians, which are replaced: first the survivors in their order, then clones, then
+            children. The running mean is discarded (see `GaussianOptimizer.append`).
+        grow_grad2d: in units of normalized device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
         grow_scale3d: Gaussians whose largest standard deviation is above this value are split, all other ones cloned.
             One value for all Gaussians, or [N]. 3DGS: 0.01.
         cap_max: maximum number of Gaussians. If there are more candidates than room, the ones with the largest
@@ -92,14 +92,14 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
 
 
 def unit(quaternions: Tensor) -> Tensor:
-    """Return the quaternions [M, 4] normalised to length 1; zero stays zero."""
+    """Return the quaternions [M, 4] normalized to length 1; zero stays zero."""
     # Divide by the largest entry first: the squares of very short quaternions would underflow.
     quaternions = quaternions / quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)
     return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float | Tensor) -> int:
-    """Remove the Gaussians of the optimizer that are too faint or too large.
+    """Remove the Gaussians of the optimizer that are too faint or too large, in place.
 
     PAPER leaves open: 3DGS also removes Gaussians that cover more than 20 pixels of a view. This limit depends on the
     image size, and would remove whole walls in small images, so it is left out here.

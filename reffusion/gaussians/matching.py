@@ -17,7 +17,7 @@ from reffusion.gaussians.movement import SAME_LOOKS, Cloud, Movement, find_movem
 
 CANDIDATES = 8  # nearest Gaussians of the whole scene with which a Gaussian of the cleaned scene is compared
 # Matching radius of a Gaussian of the whole scene, as a share of the distance to its nearest neighbor: within it a
-# position of the cleaned scene counts as the Gaussian's own position, moved by quantisation.
+# position of the cleaned scene counts as the Gaussian's own position, moved by quantization.
 MAX_DISTANCE = 0.5
 # Least radius, as a share of the median of these distances; it matters for several Gaussians at one position.
 MIN_SPACING = 0.1
@@ -48,12 +48,12 @@ class Match:
     """Correspondence between a whole scene and a cleaned one.
 
     Attributes:
-        places: int [M], for each Gaussian of the cleaned scene its index in the whole scene; -1 if it is not there.
+        places: int [M], for each Gaussian of the cleaned scene its index in the whole scene; -1 if it is not there, and
+            for all Gaussians if `movement` is None or mirrors.
         deleted: bool [N], True for the Gaussians of the whole scene that are not in the cleaned one. All False if
-            `movement` is None.
+            `movement` is None or mirrors.
         found: share in [0, 1] of the cleaned scene's Gaussians that are in the whole scene.
         movement: takes Gaussians of the whole scene to those of the cleaned one. None if the scenes are different ones.
-            If it mirrors, nothing is matched.
     """
 
     places: np.ndarray
@@ -118,7 +118,7 @@ def find_regions(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
 
     Returns:
         int [N], the number of the region; -1 for Gaussians that stay or are scattered, i.e. stood alone among others
-        that stay.
+        that stay. The numbers have gaps, and no order.
     """
     index, count = np.flatnonzero(deleted), min(NEIGHBORS, len(whole) - 1)
     distances, near = cKDTree(whole).query(whole[index], range(2, count + 2), workers=-1)  # the first is itself
@@ -143,10 +143,11 @@ def find_filtered(opacities: np.ndarray, deleted: np.ndarray) -> np.ndarray:
 
     Args:
         opacities: [N], in [0, 1], of the whole scene.
-        deleted: bool [N].
+        deleted: bool [N], with at least one False.
 
     Returns:
-        bool [N]. All False if no filter for opacity was used: if Gaussians as transparent stay.
+        bool [N]. All False if no filter for opacity was used: if Gaussians as transparent stay, or if the transparent
+        ones are at most the share `LEAST_FILTERED` of the scene.
     """
     filtered = deleted & (opacities < np.quantile(opacities[~deleted], FILTER_RANK))
     return filtered if filtered.mean() > LEAST_FILTERED else np.zeros_like(filtered)
@@ -161,7 +162,7 @@ def find_cropped(whole: np.ndarray, deleted: np.ndarray, regions: np.ndarray) ->
         regions: int [N], from `find_regions`.
 
     Returns:
-        bool [N]. All False if no region surrounds what stays. An object that stood beside it is not cropped.
+        bool [N]. All False if no region surrounds what stays. An object that stood beside what stays is not cropped.
     """
     cropped, kept = np.zeros(len(whole), bool), whole[~deleted]
     numbers, number = np.unique(regions[regions >= 0], return_inverse=True)
@@ -278,7 +279,7 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def _match_one_to_one(index: _NearIndex, points: Cloud, excluded: np.ndarray) -> np.ndarray:
-    """Match M Gaussians one to one, nearest pairs first; return int [N], the partner of each Gaussian or -1."""
+    """Match `points` one to one, nearest pairs first; return int [N], each indexed Gaussian's point or -1."""
     distances, candidates = _find_candidates(index, points.means)
     # Gaussians that are `excluded`, bool [N], cannot be matched.
     distances[excluded[candidates]] = np.inf

@@ -49,7 +49,7 @@ class Cloud:
         return len(self.means)
 
     def take(self, chosen: np.ndarray | slice) -> Cloud:
-        """Return the chosen Gaussians."""
+        """Return the Gaussians chosen by a boolean mask [N], by indices or by a slice."""
         return Cloud(*(array[chosen] for array in vars(self).values()))
 
     def looks(self) -> np.ndarray:
@@ -83,15 +83,15 @@ class Movement:
         return self.scale == 1 and np.array_equal(self.rotation, np.eye(3)) and not self.shift.any()
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Move points [..., 3]."""
+        """Return the points [..., 3] after the movement."""
         return self.scale * points @ self.rotation.T + self.shift
 
     def invert(self, points: np.ndarray) -> np.ndarray:
-        """Move points [..., 3] back."""
+        """Return the points [..., 3] before the movement, given those after it."""
         return (points - self.shift) @ self.rotation / self.scale
 
     def describe(self) -> str:
-        """Return in words what the movement does, as "scaled by 2, turned by 30 degrees and shifted"."""
+        """Return what the movement does, as "scaled by 2, turned by 30 degrees and shifted"; "" if nothing."""
         angle = np.degrees(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1)))
         parts = [f"scaled by {self.scale:.4g}"] if abs(self.scale - 1) > 1e-4 else []
         parts += [f"turned by {angle:.3g} degrees"] if angle > 0.01 else []
@@ -119,9 +119,10 @@ def fit_movement(points: np.ndarray, moved: np.ndarray, mirrors: bool = False) -
 
 
 def find_movement(whole: Cloud, moved: Cloud) -> Movement | None:
-    """Find the movement that takes Gaussians of the whole scene to those of the moved one; None without any.
+    """Return the movement that takes Gaussians of the whole scene to those of the moved one; None if none is found.
 
-    The moved scene may lack Gaussians, have others, and be quantized and in another order. It was not moved in parts.
+    The moved scene may lack Gaussians, have others, and be quantized and in another order. It was moved as one. The
+    result is `STILL` if the movement is within the errors of quantization.
 
     Args:
         whole: N >= 2 Gaussians.
@@ -149,7 +150,7 @@ def find_movement(whole: Cloud, moved: Cloud) -> Movement | None:
 
 
 def _search(points: np.ndarray, targets: np.ndarray, scale: float, mirrors: bool) -> tuple[Movement, int]:
-    """Find the movement that explains most pairs of points [P, 3] and targets, and count these pairs."""
+    """Return the movement that explains most pairs of points and targets [P, 3], and their number; 0 if it is wrong."""
     draws = np.random.default_rng(0)
     extent = float(np.linalg.norm(np.percentile(targets, 90, axis=0) - np.percentile(targets, 10, axis=0)))
     triples = draws.integers(len(points), size=(TRIPLES, 3))

@@ -50,7 +50,7 @@ def find_neighbors(gaussians: Gaussians) -> NeighborGraph:
 
 
 def measure_overlap(gaussians: Gaussians, pairs: np.ndarray) -> np.ndarray:
-    """Compute how much the two Gaussians of each pair overlap: exp(-g^2 / 2).
+    """Return how much the two Gaussians of each pair overlap: exp(-g^2 / 2), 1 if their means coincide.
 
     Here g is the distance of their means, over the sum of their standard deviations along the line between the means.
 

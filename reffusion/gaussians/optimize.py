@@ -65,7 +65,7 @@ def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
 class Rates:
     """Adam's learning rates for the parameters of Gaussians.
 
-    The defaults are those of 3DGS, for the normalised frame, in which cameras are about 1 from the scene.
+    The defaults are those of 3DGS, for the normalized frame, in which cameras are about 1 from the scene.
 
     Attributes:
         means: learning rate of positions at the start, in units of the frame; it decays exponentially to `means_last`.
@@ -84,7 +84,7 @@ class Rates:
     sh_rest: float = 2.5e-3 / 20
 
     def in_units_of(self, unit: float) -> Rates:
-        """Return these rates, with the rates of positions multiplied by `unit`, a length in the normalised frame."""
+        """Return these rates, with the rates of positions multiplied by `unit`, a length in the normalized frame."""
         return replace(self, means=unit * self.means, means_last=unit * self.means_last)
 
     def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
@@ -162,7 +162,7 @@ class GaussianOptimizer:
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add the norms of the screen-space gradients of one view to `grad2d_sum`, from which `densify` takes means.
 
-        3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. So
+        3DGS measures in normalized device coordinates, where the image spans [-1, 1]: one unit is half the image. So
         gradients with respect to pixels are multiplied by `width / 2` and `height / 2`. Since the loss is a mean over
         pixels, the result depends neither on the size of the image nor on the size of the scene.
 
@@ -182,7 +182,7 @@ class GaussianOptimizer:
         self.grad2d_count = torch.zeros_like(self._steps)
 
     def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
-        """Do one Adam step with the gradients in `.grad` of the parameters, and clear these gradients.
+        """Take one Adam step with the gradients in `.grad` of the parameters, and clear these gradients.
 
         A parameter without a gradient stays unchanged.
 
@@ -260,7 +260,7 @@ class GaussianOptimizer:
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
         """Append M Gaussians, whose moments and step counts start at zero.
 
-        The running mean (`remember`) and `.grad` are discarded.
+        The running mean (`remember`) and `.grad` are discarded. The new Gaussians come last.
 
         Args:
             masked: [M] bool, the labels of the new Gaussians, see `masked` of the class.
@@ -295,7 +295,7 @@ class GaussianOptimizer:
         return state | {name: getattr(self, name).clone() for name in self._COUNTERS} | {"meant": self._meant}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state returned by `state_dict`; its number of Gaussians may differ from the present one."""
+        """Restore a state that `state_dict` returned; it may have another number of Gaussians than the present one."""
         self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
         self._first = Gaussians(**state["first"]).map(torch.clone)
         self._second = Gaussians(**state["second"]).map(torch.clone)
@@ -314,7 +314,7 @@ def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
     """Raise FloatingPointError if a gradient is NaN or infinite; the message names the parameter.
 
     Args:
-        gradients: parameter name -> gradient, or None without one.
+        gradients: parameter name -> gradient; None for a parameter without gradient, which passes.
     """
     # A sum is finite only if every term is, and needs no array of flags; all sums are checked at once.
     sums = {name: gradient.sum() for name, gradient in gradients.items() if gradient is not None}

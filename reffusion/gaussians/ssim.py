@@ -1,6 +1,6 @@
 """Structural similarity over windows that leave out masked pixels, differentiable in the first image.
 
-Windows are those of 3DGS: Gaussian, 11 x 11, sigma 1.5. Local statistics are *normalised convolutions*: weighted sums
+Windows are those of 3DGS: Gaussian, 11 x 11, sigma 1.5. Local statistics are *normalized convolutions*: weighted sums
 divided by the sum of the weights in the window. So a pixel of weight 0 is in no window, and neither is a pixel outside
 the image (3DGS counts pixels outside as black). The alternative is to make both images equal where they are masked. It
 would put an edge that both images share into the windows around a mask, and so raise the similarity there.
@@ -62,7 +62,7 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
 def triton_works() -> bool:
     """Return whether `gaussians.cuda_kernels` can be used: there is a CUDA device, and Triton can compile for it.
 
-    Triton comes with torch's CUDA builds.
+    The answer is kept. If Triton is installed and fails, the reason is printed.
     """
     if not torch.cuda.is_available() or find_spec("triton") is None:
         return False
@@ -74,7 +74,7 @@ def triton_works() -> bool:
 def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
     """Compute `dssim` in plain torch, on any device and in any dtype; the kernels are tested against this function.
 
-    Unlike in `dssim`, pixels of weight 0 must be finite.
+    Unlike in `dssim`, pixels of weight 0 must be finite, and weights must have the images' dtype.
     """
     if weights is None:
         weights = torch.ones_like(image[..., 0])
@@ -152,7 +152,7 @@ class _FastDssim(torch.autograd.Function):
 
 
 def _allocate_fields(count: int, image: np.ndarray) -> np.ndarray:
-    """Return `count` uninitialised fields [count, H + 10, W * C], with 5 rows of zeros above and below each."""
+    """Return `count` uninitialized fields [count, H + 10, W * C], with 5 rows of zeros above and below each."""
     fields = empty_aligned(count, image.shape[0] + 2 * RADIUS, image.shape[1])
     fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
     return fields

@@ -99,7 +99,7 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """
     disparity = np.divide(1.0, depth, out=np.zeros(depth.shape), where=np.asarray(depth) > 0)
     along_x, along_y = one_sided_slope(disparity.T).T, one_sided_slope(disparity)
-    # disparity = a x + b y + c over normalised image points is the plane with normal (a, b, c) in camera axes.
+    # disparity = a x + b y + c over normalized image points is the plane with normal (a, b, c) in camera axes.
     rays = pixel_rays(camera)
     a, b = along_x * camera.fx, along_y * camera.fy
     normal = np.stack([a, b, disparity - a * rays[..., 0] - b * rays[..., 1]], -1)
@@ -109,10 +109,10 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def one_sided_slope(values: np.ndarray) -> np.ndarray:
-    """Return the derivative of values [H, W] down the rows, per row.
+    """Return the derivative of values [H, W] down the rows, per row, [H, W].
 
     At each element it is the forward or the backward difference, whichever has the smaller second difference next to
-    it. It is 0 where both second differences exceed `STEP` times the value.
+    it. It is 0 where both second differences exceed `STEP` times the absolute value.
     """
     if len(values) < 3:
         return np.gradient(values, axis=0) if len(values) > 1 else np.zeros_like(values)

@@ -32,14 +32,15 @@ def file_of(path: Path) -> Path:
 
 
 def is_labelme(path: Path) -> bool:
-    """Return whether a .json file holds the outlines of one picture."""
+    """Return whether a .json file is labelme's, for one picture. Raises BadInput if the file is unreadable."""
     return "shapes" in _load(path)
 
 
 def annotated_pictures(path: Path) -> list[str]:
-    """Return the file names of the pictures with outlines in a COCO file; empty for other .json files.
+    """Return the sorted file names of the pictures with outlines in a COCO file; empty for other .json files.
 
     Pictures without outlines are left out: nothing tells whether they show no object, or were not annotated yet.
+    Raises BadInput if the file is unreadable.
     """
     record = _load(path)
     with as_bad_input(path, KIND):
@@ -48,7 +49,7 @@ def annotated_pictures(path: Path) -> list[str]:
 
 
 def annotation_size(path: Path) -> tuple[int, int]:
-    """Return the (width, height) in pixels of the picture to which the outlines at `path` belong."""
+    """Return the (width, height) in px of the picture whose outlines are at `path`; raises BadInput if unreadable."""
     file, record = file_of(path), _load(file_of(path))
     with as_bad_input(file, KIND):
         names = ("imageWidth", "imageHeight") if file == path else ("width", "height")
@@ -63,11 +64,12 @@ def load_annotation(path: Path, categories: tuple[int, ...] = ()) -> np.ndarray:
     Outlines themselves belong to the mask, as in labelme's own export. COCO's may be polygons or uncompressed runs.
 
     Args:
-        categories: numbers of the categories of a COCO file that are the object; empty if there is only one.
+        categories: numbers of the categories of a COCO file that are the object; empty if there is only one, and for
+            labelme's files.
 
     Raises:
-        BadInput: the file is unreadable, or has outlines of several labels or categories, or of another kind. The
-            message names the file.
+        BadInput: the file is unreadable, or has outlines of several labels, of several categories without
+            `categories`, or of another kind. The message names the file.
     """
     file, record, (width, height) = file_of(path), _load(file_of(path)), annotation_size(path)
     with as_bad_input(file, KIND):
@@ -88,6 +90,7 @@ def _load(file: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=2)
 def _load_once(file: Path, _changed: int) -> dict[str, Any]:
+    """Read a .json file as `_load` does; the cache is keyed by the file and its time of change."""
     record = load_json(file)
     return record if isinstance(record, dict) else {}
 
@@ -104,7 +107,7 @@ def _picture(record: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _one_label(path: Path, shapes: list[dict[str, Any]], categories: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Return labelme's shapes. Raises BadInput if they have several labels."""
+    """Return labelme's shapes. Raises BadInput if they have several labels, or if `categories` is not empty."""
     labels = sorted({str(shape["label"]) for shape in shapes})
     if len(labels) > 1 or categories:
         found = f"{len(labels)} labels ({', '.join(labels)})" if len(labels) > 1 else "labels are no object numbers"

@@ -46,10 +46,10 @@ def save_cameras(folder: Path, scene: Scene, images: str) -> None:
 
 
 def scene_frame_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
-    """Convert a camera's pose from the normalised frame to the scene's own frame and unit.
+    """Convert a camera's pose from the normalized frame to the scene's own frame and unit.
 
     Args:
-        similarity: from the scene's own frame to the normalised frame.
+        similarity: from the scene's own frame to the normalized frame.
 
     Returns:
         The world-to-camera transform, [4, 4] float64.

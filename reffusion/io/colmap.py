@@ -79,7 +79,7 @@ def model_file(folder: Path, stem: str) -> Path | None:
 
 
 def is_model(folder: Path) -> bool:
-    """Return whether the folder has the files cameras and images of a COLMAP model. points3D may be missing."""
+    """Return whether the folder has the files cameras and images of a COLMAP model; points3D may be missing."""
     return model_file(folder, "cameras") is not None and model_file(folder, "images") is not None
 
 
@@ -143,6 +143,7 @@ def _cameras_text(path: Path) -> dict[int, ModelCamera]:
 
 
 def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path) -> None:
+    """Add a value to `found` under its id; raises BadInput if the id exists already."""
     if identity in found:
         raise BadInput(f"{path}: the number {identity} comes twice")
     found[identity] = value
@@ -213,6 +214,7 @@ def _images_text(path: Path) -> dict[int, ModelImage]:
 
 
 def _check_name(name: str, path: Path) -> str:
+    """Return the file name of an image; raises BadInput if it has no stem or contains a zero byte."""
     if not Path(name).stem or "\0" in name:
         raise BadInput(f"{path}: an image without a name")
     return name

@@ -1,6 +1,6 @@
-"""Reading and writing of quantised files by the library gsply: PlayCanvas's compressed .ply and Niantic's .spz.
+"""Reading and writing of quantized files by the library gsply: PlayCanvas's compressed .ply and Niantic's .spz.
 
-A compressed .ply is quantised in chunks of 256 Gaussians. This is the only module that imports gsply.
+A compressed .ply is quantized in chunks of 256 Gaussians. This is the only module that imports gsply.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
 
 MIP_COMMENT = "SplatRenderMode: mip"  # the comment by which Brush marks a .ply as antialiased; splat-transform reads it
-PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognised
+PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognized
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
 SPZ_LIMIT = 2.0**22  # coordinates are below: 24 bits, one of them fractional, one the sign
 SPZ_FLAGS = 14  # index of the byte of flags in the header; its lowest bit means antialiased
@@ -30,15 +30,15 @@ TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], n
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
-    """Write Gaussians as a compressed .ply in the scene's own frame.
+    """Write Gaussians as a compressed .ply in the scene's own frame, and create its folder.
 
-    The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantisation is fine. The x, y
+    The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantization is fine. The x, y
     and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colors, opacity and spherical harmonics keep 8
     bits.
 
     Args:
-        gaussians: in the normalised frame, on the CPU.
-        similarity: from the scene's own frame to the normalised frame.
+        gaussians: in the normalized frame, on the CPU.
+        similarity: from the scene's own frame to the normalized frame.
 
     Raises:
         BadInput: gsply is not installed.
@@ -108,7 +108,7 @@ def load_spz(path: Path) -> Rows:
 
 
 def save_spz(path: Path, rows: Rows, antialiased: bool = False) -> None:
-    """Write rows as a .spz file of version 3.
+    """Write rows as a .spz file of version 3, and create its folder.
 
     Positions are fixed-point numbers of 24 bits. As many bits as the largest coordinate allows are fractional.
 

@@ -41,6 +41,7 @@ def load_depth(path: Path) -> np.ndarray:
 
 
 def _values(path: Path) -> np.ndarray:
+    """Read the array of a file in its own type; raises BadInput if it is unreadable or a picture of 8 bits."""
     if path.suffix.lower() == ".exr":
         return load_exr(path)
     if path.suffix.lower() == ".npy":

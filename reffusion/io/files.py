@@ -116,7 +116,7 @@ class Cursor:
         self.path, self.data, self.at = path, Path(path).read_bytes(), 0
 
     def read(self, layout: str) -> tuple:
-        """Read values in a layout of the module `struct`, without byte order, and advance."""
+        """Return the values of a layout of the module `struct`, given without byte order, and advance beyond them."""
         layout = "<" + layout
         self.check_left(1, struct.calcsize(layout))
         values = struct.unpack_from(layout, self.data, self.at)
@@ -129,13 +129,13 @@ class Cursor:
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
 
     def read_count(self, size: int) -> int:
-        """Read a number of records (uint64), and check that so many records of at least `size` bytes can follow."""
+        """Read and return a count (uint64). Raises BadInput if fewer than so many records of `size` bytes follow."""
         (count,) = self.read("Q")
         self.check_left(count, size)
         return count
 
     def read_text(self) -> str:
-        """Read text that ends with a zero byte, and advance beyond this byte."""
+        """Return the UTF-8 text before the next zero byte, and advance beyond this byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
@@ -143,6 +143,6 @@ class Cursor:
         return name
 
     def check_end(self) -> None:
-        """Raise BadInput if bytes are left."""
+        """Raise BadInput if bytes follow that were not read."""
         if self.at != len(self.data):
             raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes too many at its end; write the model again")

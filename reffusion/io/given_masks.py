@@ -48,7 +48,7 @@ WHITE = MaskValues()  # the object is white
 
 
 def mask_file_size(path: Path) -> tuple[int, int]:
-    """Return the (width, height) of a mask in pixels. The file may be of any kind that `load_given_mask` reads."""
+    """Return the (width, height) in px of any mask that `load_given_mask` reads; raises BadInput if unreadable."""
     if is_annotation(path):
         return annotation_size(path)
     if path.suffix.lower() == ".npy":
@@ -93,7 +93,7 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
 
 
 def load_united_masks(paths: Sequence[Path], size: tuple[int, int]) -> np.ndarray:
-    """Read masks of one picture as bool [H, W], True where one of them is white; `size` is (height, width)."""
+    """Return the union, bool [H, W], of one or more masks (`load_given_mask`), resized to `size`, (height, width)."""
     return np.logical_or.reduce([load_given_mask(path, size) for path in paths])
 
 

@@ -37,7 +37,7 @@ LARGEST = 2**32 - 1  # bytes of a .glb
 
 @dataclass(frozen=True)
 class Glb:
-    """A file's JSON, and the place of its binary chunk."""
+    """A file's JSON, `document`, and `start`, the offset in bytes at which the data of its binary chunk begins."""
 
     path: Path
     document: dict[str, Any]
@@ -63,7 +63,10 @@ class Glb:
         return int(self.document["accessors"][primitive["attributes"]["POSITION"]]["count"])
 
     def values(self, primitive: dict[str, Any], name: str) -> np.ndarray:
-        """Return the values [N, width] of an attribute, integers scaled to [-1, 1] or [0, 1] if they are normalized."""
+        """Return an attribute as float32 [N, width], normalized integers scaled to [-1, 1] or [0, 1].
+
+        Raises BadInput if the values are compressed, sparse, in another file, or not as many as splats.
+        """
         accessor = self.document["accessors"][primitive["attributes"][name]]
         view = self.document["bufferViews"][accessor["bufferView"]]
         kind: np.dtype[Any] = TYPES[accessor["componentType"]]
@@ -108,7 +111,7 @@ def open_glb(path: Path) -> Glb:
 
 
 def summarize_glb(path: Path) -> tuple[int, bool]:
-    """Return the number of splats, and whether they are antialiased, from the header. Raises as `open_glb`."""
+    """Return the number of splats, and whether all are antialiased, from the JSON. Raises as `open_glb`."""
     glb = open_glb(path)
     with reading(path, "a .glb file"):
         primitives = [primitive for primitive, _ in glb.primitives()]

@@ -21,7 +21,7 @@ def load_ground_truth(camera: Camera, poses: Path) -> np.ndarray | None:
         poses: folder of the stage `poses`.
 
     Raises:
-        ValueError: the picture and the camera differ in size.
+        ValueError: the picture is unreadable, or it and the camera differ in size.
     """
     path = poses / "images" / f"{camera.name}.png"
     if not path.exists():
@@ -38,8 +38,9 @@ def load_object_mask(camera: Camera, raw_masks: Path, masks: Path | None) -> np.
     """Read the object's mask in a view as bool [H, W], True = the object.
 
     The mask is the first of the following that exists: the view's test mask; its consistent mask C (the rendered labels
-    of the object's Gaussians); its raw mask (of all objects together), as a variant may skip the stage `masks`; an
-    empty mask. The test mask comes first, so that all variants of a scene with test masks are scored in the same box.
+    of the object's Gaussians); its raw mask (the union over all objects, if each has one), as a variant may skip the
+    stage `masks`; an empty mask. The test mask comes first, so that all variants of a scene with test masks are scored
+    in the same box.
 
     Args:
         raw_masks, masks: folders of the stages of these names; `masks` is None if that stage was skipped.

@@ -87,7 +87,7 @@ def _refuse_float_colors(path: Path) -> None:
 
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
-    """Return the (width, height) of a picture in pixels; only the file's header is read.
+    """Return the (width, height) of a picture in pixels; only the file's header is read. Raises as `open_image`.
 
     Args:
         upright: True applies the orientation tag, as in `load_image`.
@@ -187,7 +187,7 @@ def _to_rgb(image: Image.Image) -> Image.Image:
 
 
 def load_alpha(path: Path, upright: bool = False) -> np.ndarray | None:
-    """Read the alpha channel of a picture as uint8 [H, W]; None if every pixel is opaque.
+    """Read the alpha channel of a picture as uint8 [H, W]; None without one, or if every pixel is opaque.
 
     Args:
         upright: True applies the orientation tag, as in `load_image`.
@@ -203,9 +203,9 @@ def load_alpha(path: Path, upright: bool = False) -> np.ndarray | None:
 
 
 def load_thumbnail(path: Path, side: int, upright: bool = False) -> np.ndarray:
-    """Read a picture, reduced so that its longer side is at most `side` px, as uint8 [h, w, 3].
+    """Read a picture, reduced so that its longer side is at most `side` px, as uint8 [h, w, 3] over black.
 
-    OpenCV is not imported.
+    A picture is never enlarged. OpenCV is not imported.
 
     Args:
         upright: True applies the orientation tag, as in `load_image`.
@@ -293,7 +293,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resize a picture, uint8 [h, w, 3] or [h, w], to `size`.
 
-    The interpolation is area averaging if neither side grows, and bicubic else. A picture that has this size already is
+    The interpolation is area averaging if neither side grows, else bicubic. A picture that has this size already is
     returned itself, not as a copy.
 
     Args:
@@ -308,7 +308,7 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize an array [H, W, ...] to [*size, ...] by nearest neighbor.
+    """Return an array [H, W, ...] resized to [*size, ...] by nearest neighbor, as a copy.
 
     Each new pixel takes the value of the old pixel that contains the new pixel's center.
 

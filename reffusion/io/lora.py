@@ -15,7 +15,7 @@ def save_portable(source: Path, path: Path) -> None:
 
     A LoRA adds (alpha / rank) B A to a weight matrix. Here the factor alpha / rank is multiplied into B, and alpha is
     set to the rank, so that the product stays the same with a factor of 1. Dropout is set to 0, because the copy is for
-    inference.
+    inference. Weights without a rank in the metadata stay as they are.
 
     Args:
         source: the .safetensors file that diffusers saved.

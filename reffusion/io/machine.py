@@ -61,8 +61,8 @@ def detect() -> Machine:
 def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
     """Return what prevents this machine from running a stage on CUDA, one line each with the remedy.
 
-    The list is empty if nothing is known to be missing. The function assumes that an NVIDIA driver is present. The
-    command `plan` reports a missing driver before.
+    The list is empty if nothing is known to be missing. Unknown parts are left out, and so is a missing
+    NVIDIA driver, which the command `plan` reports before.
 
     Args:
         here: this machine, from `detect`.
@@ -115,6 +115,7 @@ def _older_torch(cuda_major: int | None) -> str:
 
 
 def _major(version: str | None) -> int | None:
+    """Return the major number of a version such as "13.0"; None for None or ""."""
     return int(version.split(".")[0]) if version else None
 
 

@@ -43,9 +43,9 @@ def save_ply(
     red, then green, then blue. The opacity is a logit, scales are logarithms, and rotations are wxyz. Normals are zero.
 
     Args:
-        similarity: from the scene's own frame to the normalised frame of `gaussians`. If given, positions and sizes are
+        similarity: from the scene's own frame to the normalized frame of `gaussians`. If given, positions and sizes are
             converted (in float64) to the scene's own frame. Positions are then written as doubles if rounding to floats
-            would move one by more than 1e-5 of the normalised extent, as in geo-referenced scenes. In all other cases
+            would move one by more than 1e-5 of the normalized extent, as in geo-referenced scenes. In all other cases
             they are floats, because some viewers read floats only.
         properties: names of properties in the order in which they are written, such as `load_property_names` of a file
             to match. Missing ones are appended, except normals; unknown ones are ignored. Empty: the order above.
@@ -97,12 +97,16 @@ def check_can_save(path: Path) -> None:
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
     """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
-    All formats but .splat store `Gaussians.antialiased`; that of a .glb only this project reads.
+    All formats but .splat store `Gaussians.antialiased`; that of a .glb only this project reads. The file's folder is
+    created.
 
     Args:
-        gaussians: in the normalised frame.
-        similarity: from the scene's own frame to the normalised frame.
+        gaussians: in the normalized frame.
+        similarity: from the scene's own frame to the normalized frame.
         properties: order of the properties of a plain .ply, as in `save_ply`; other formats ignore it.
+
+    Raises:
+        ValueError: the ending is unknown, a library is missing, or the scene is too large for the format (BadInput).
     """
     name = Path(path).name.lower()
     if name.endswith((".spz", ".splat", ".glb")):
@@ -128,12 +132,13 @@ def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cp
     """Read the Gaussians of a file as float32 on `device`, see `splats.load_splats`.
 
     Args:
-        similarity: from the scene's own frame, in which the file then is, to the normalised frame, in which the result
+        similarity: from the scene's own frame, in which the file then is, to the normalized frame, in which the result
             then is. None keeps the file's frame.
 
     Raises:
-        BadInput: properties are missing (e.g. in a plain point cloud), the number of `f_rest` properties belongs to no
-            degree, most rows are not finite, or a value exceeds float32. The message names the file.
+        BadInput: the file is unreadable, properties are missing (e.g. in a plain point cloud), the number of `f_rest`
+            properties belongs to no degree, most rows are not finite, or a value exceeds float32. The message names the
+            file.
     """
     gaussians = load_splats(path).gaussians(similarity)
     if not (gaussians.means.isfinite().all() and gaussians.log_scales.isfinite().all()):
@@ -156,7 +161,7 @@ def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         positions: [P, 3] float64.
-        colors: [P, 3] uint8; mid gray if the file has no colors red, green and blue.
+        colors: [P, 3] uint8, scaled from [0, 1] if they are floats; mid gray if the file has no red, green and blue.
 
     Raises:
         BadInput: the file is unreadable, or its vertices have no x, y, z.
@@ -172,6 +177,7 @@ def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and colors of a vertex table, as `load_points`."""
     if any(name not in table.dtype.names for name in POSITION):
         raise BadInput(f"{path}: its vertices have no x, y, z")
     points = np.stack([table[n] for n in POSITION], axis=1).astype(np.float64)
@@ -184,5 +190,5 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_property_names(path: Path) -> tuple[str, ...]:
-    """Return the names of the vertex properties of a .ply of Gaussians, in order; empty for a quantised file."""
+    """Return the vertex properties of a plain .ply, in order; () for other formats. Raises as `summarize_splats`."""
     return summarize_splats(path).properties

@@ -13,7 +13,7 @@ def quaternion_to_pose(
     """Return the rigid transform [4, 4] float64 of a rotation and a translation.
 
     Args:
-        quaternion: [4], wxyz, of any length; it is normalised. The rotation of a zero quaternion is not finite.
+        quaternion: [4], wxyz, of any length; it is normalized. The rotation of a zero quaternion is not finite.
         translation: [3].
     """
     with np.errstate(all="ignore"):

@@ -30,7 +30,7 @@ PIXEL_CLASSES = ("raw", "consistent", "unobserved", "invent")
 def save_scene(poses_dir: Path, scene: Scene) -> None:
     """Write a scene as sparse/0/*.bin, transform.json and views.json; pictures are not written.
 
-    The cameras in sparse/0/ are of COLMAP's model PINHOLE, in the normalised frame. transform.json holds the
+    The cameras in sparse/0/ are of COLMAP's model PINHOLE, in the normalized frame. transform.json holds the
     similarity. views.json holds the names of training, test and clean views (clean: without the object), and of
     camera-only views, suspects and outliers if there are any (`reffusion.types.Scene`).
     """
@@ -50,7 +50,7 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
 
 
 def load_scene(poses_dir: Path) -> Scene:
-    """Read the scene that the stage `poses` wrote, in the normalised frame.
+    """Read the scene that the stage `poses` wrote, in the normalized frame.
 
     Raises:
         ValueError: a file is missing or wrong; the message names it.
@@ -86,14 +86,14 @@ def load_scene(poses_dir: Path) -> Scene:
 
 
 def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read the undistorted pictures of the named views, as a dict view name -> uint8 [H, W, 3]."""
+    """Read the undistorted pictures of views as a dict name -> uint8 [H, W, 3]; raises BadInput if one is missing."""
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
 def load_ignored(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read which pixels of the named views are ignored, as a dict view name -> bool [H, W].
 
-    They show what passes by or what moves with the camera: they neither train nor are filled. A view that ignores
+    Ignored pixels show what passes by or moves with the camera. They neither train nor are filled. A view that ignores
     nothing has no entry.
     """
     files = {name: Path(poses_dir) / IGNORED / f"{name}.png" for name in names}
@@ -178,7 +178,7 @@ def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
 
 
 def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
-    """Read the pixel classes that the stage `masks` wrote, as a dict view name -> MaskSet."""
+    """Read the pixel classes that the stage `masks` wrote for the named views, as a dict view name -> MaskSet."""
     from reffusion.types import MaskSet
 
     load = lambda kind, name: load_mask(Path(masks_dir) / kind / f"{name}.png")
@@ -226,7 +226,7 @@ def save_teaching(reference_dir: Path, pictures: Mapping[str, np.ndarray]) -> No
 
 
 def load_teaching(reference_dir: Path) -> list[np.ndarray]:
-    """Read the pictures that `save_teaching` wrote, sorted by name."""
+    """Read the pictures that `save_teaching` wrote, uint8 [H, W, 3] each, sorted by name; empty if there are none."""
     return [load_image(path) for path in sorted((Path(reference_dir) / "teaching").glob("*.png"))]
 
 
@@ -235,7 +235,7 @@ def _depth_file(reference_dir: Path, view: str) -> Path:
 
 
 def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
-    """Read the references that `save_references` wrote, sorted by view name.
+    """Read the references that `save_references` wrote, sorted by view name; empty if there are none.
 
     Raises:
         ValueError: a reference belongs to no view of the scene or has no mask, or its picture, mask or depth is not of

@@ -19,15 +19,15 @@ from reffusion.types import Gaussians, Similarity
 
 
 def repeat_edit(poses: Path, gaussians: Gaussians, new: Tensor) -> tuple[Gaussians, Similarity, Tensor]:
-    """Crop, merge and move a filled scene as the user did.
+    """Return a filled scene, cropped, merged and moved as the user did in an editor; unchanged without such edits.
 
     Args:
         poses: folder of the stage `poses`.
-        gaussians: N Gaussians in the normalised frame.
+        gaussians: N Gaussians in the normalized frame, on the CPU.
         new: bool [N], True for those that fill the hole.
 
     Returns:
-        The Gaussians in the normalised frame, turned as the user turned the scene; the similarity from the frame of the
+        The Gaussians in the normalized frame, turned as the user turned the scene; the similarity from the frame of the
         user's file to that frame; and `new` for these Gaussians.
     """
     similarity = load_scene(poses).similarity

@@ -33,7 +33,7 @@ def count_splat(path: Path) -> int:
 
 
 def open_splat(path: Path) -> Callable[[slice], Rows]:
-    """Return a function that reads the rows of a slice of the file.
+    """Return a function that reads the rows of a slice of the file, which `count_splat` must accept.
 
     A record of 32 zero bytes (padding) gives a row of zeros. An opacity of 0 or 255 gives an infinite logit, and a size
     of 0 a log-scale of minus infinity.

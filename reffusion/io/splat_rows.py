@@ -22,7 +22,7 @@ DEGREE = 3  # highest degree of spherical harmonics that is rendered
 
 @dataclass(frozen=True)
 class Rows:
-    """The N splats of a file, or of a block of its rows, parametrised as `reffusion.types.Gaussians`.
+    """The N splats of a file, or of a block of its rows, parametrized as `reffusion.types.Gaussians`.
 
     Attributes:
         means: [N, 3] float64.
@@ -43,7 +43,7 @@ class Rows:
 
     @property
     def unit_quaternions(self) -> np.ndarray:
-        """The normalised quaternions, [N, 4]. Zero quaternions become the identity (1, 0, 0, 0)."""
+        """The normalized quaternions, [N, 4]. Zero quaternions become the identity (1, 0, 0, 0)."""
         lengths = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
         return np.where(lengths > 0, self.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
 
@@ -138,7 +138,7 @@ def fold_filter(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -
     Args:
         log_scales: [N, 3].
         logits: [N], opacity logits.
-        sizes: [N], standard deviations f of the filters.
+        sizes: [N], standard deviations f of the filters; their sign is ignored, and 0 changes nothing.
 
     Returns:
         log_scales: [N, 3] float64, widened by the filter.

@@ -59,7 +59,7 @@ def save_for_web(path: Path, source: Path, antialiased: bool) -> None:
 
 
 def convert_to_ply(path: Path, folder: Path) -> Path:
-    """Convert a file that `is_convertible` to a .ply in `folder`, and return its path. Raises as `save_for_web`."""
+    """Write a file that `is_convertible` as converted.ply in `folder`; return its path. Raises as `save_for_web`."""
     with reading(path, f"a {path.suffix} file"):
         target = folder / "converted.ply"
         _convert(check_node(path), path, target, FINEST if path.suffix.lower().startswith(".lcc") else ())
@@ -67,7 +67,10 @@ def convert_to_ply(path: Path, folder: Path) -> Path:
 
 
 def is_antialiased(path: Path) -> bool:
-    """Return whether a .sog or its meta.json says that splats are rendered with Mip-Splatting's 2D filter."""
+    """Return whether a .sog or its meta.json asks for Mip-Splatting's 2D filter; False for any other file.
+
+    Raises BadInput if the file is unreadable.
+    """
     if path.suffix.lower() == ".sog":
         with reading(path, "a .sog file"), zipfile.ZipFile(path) as archive:
             return json.loads(archive.read(META)).get("model") == "antialiased"

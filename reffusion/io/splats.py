@@ -71,7 +71,7 @@ class Splats:
         """Return the Gaussians as float32 tensors on the CPU.
 
         Args:
-            similarity: from the file's frame to the normalised frame, into which the result is converted; None keeps
+            similarity: from the file's frame to the normalized frame, into which the result is converted; None keeps
                 the file's frame.
         """
         import torch
@@ -104,7 +104,7 @@ class Summary:
 
 
 def summarize_splats(path: Path) -> Summary:
-    """Read the header of a file of Gaussians.
+    """Return what the header of a file of Gaussians tells; no rows are read.
 
     Raises:
         BadInput: the file is truncated, is no file of Gaussians, or has a format that is not read; or gsply or Node is
@@ -149,8 +149,8 @@ def load_splats(path: Path) -> Splats:
     """Read the Gaussians of a file. Invalid rows are dropped, see `splat_rows.drop_invalid`.
 
     Raises:
-        BadInput: the file cannot be read or is no file of Gaussians, more than half of its rows are invalid, or none is
-            left. The message names the file.
+        BadInput: the file cannot be read or is no file of Gaussians, more than half of its rows are invalid, or all of
+            them are dropped. A file of 0 rows is no error. The message names the file.
     """
     path = Path(path)
     is_file(path)

@@ -65,7 +65,8 @@ MAIN = {  # stage -> candidates for the quantity that is shown as its error: the
 def read_trace(path: Path) -> list[dict[str, Any]]:
     """Read the lines of a `trace.jsonl` as dicts, without checking them against the schema.
 
-    A line that is not valid JSON is skipped, because a killed process may leave an incomplete line.
+    A line that is not valid JSON is skipped, because a killed process may leave an incomplete line. A missing file
+    raises FileNotFoundError.
     """
     return [record for _, record in _read_numbered_records(path)]
 

@@ -98,7 +98,7 @@ def evaluate_depth(
         max_side: Longer side, in pixels, at which a larger view is rendered. The returned rendering has this size.
 
     Raises:
-        Degenerate: No pixel of the view can be compared, or its estimate cannot be aligned with the scene.
+        Degenerate: No pixel of the view can be compared, or the estimate cannot be aligned with the scene.
         FloatingPointError: An estimate is not finite.
     """
     camera, hole, hidden = _downscale(view, max_side)
@@ -160,7 +160,7 @@ def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, unit: float) -> 
 
 
 def _downscale(view: TrainView, max_side: int) -> tuple[Camera, Tensor, Tensor]:
-    """Return camera, hole (bool [H, W]) and hidden pixels (bool [H, W]) of a view, at most `max_side` px large."""
+    """Return camera, hole and hidden pixels (bool [H, W] each) of a view whose longer side is at most `max_side` px."""
     # The photograph may not supervise hidden pixels.
     camera, hole, hidden = view.camera, view.repaint, ~view.supervises
     factor = max_side / max(camera.width, camera.height)

@@ -22,7 +22,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     Its gradient reaches the masked Gaussians, or with `confined: false` all.
 
     Raises:
-        ValueError: No view was inpainted, or the perceptual loss has no distance.
+        ValueError: The weight is not 0, and no view was inpainted or the perceptual loss has no distance.
     """
     lift = settings.lift
     if lift.weight == 0:

@@ -45,10 +45,11 @@ def evaluate_reference(
 ) -> tuple[Tensor, Rendering]:
     """Return the reconstruction loss over a reference's hole, and the rendering of the part of the view around it.
 
-    Only the bounding box of the hole is rendered. The loss is scaled to the value that it would have if the whole view
-    were rendered, where the sum over the hole is divided by the number of all pixels.
+    Only the bounding box of the hole is rendered, or the whole view if the hole is empty. The loss is scaled to the
+    value that it would have if the whole view were rendered, where the sum over the hole is divided by the number of
+    all pixels.
 
-    PAPER leaves open: whether the reference supervises directly. In the paper it only initialises and personalises.
+    PAPER leaves open: whether the reference supervises directly. In the paper it only initializes and personalizes.
 
     Args:
         gaussians: All Gaussians of the scene.

@@ -80,7 +80,7 @@ def views_near_references(
 
     Args:
         views: The views to choose from.
-        references: The cameras of the references.
+        references: The cameras of the references, at least one unless all views are returned.
         means: [M, 3], centers of the masked Gaussians. If M = 0, all views are returned.
         max_angle: Degrees. With 180 all views are returned.
     """
@@ -94,7 +94,7 @@ def views_near_references(
 def describe_sds_views(
     sds: SdsTerm, means: Tensor, views: Sequence[TrainView], references: Sequence[ReferenceHole]
 ) -> str:
-    """Return a sentence that says how many of the views with a hole are distilled.
+    """Return a phrase that says how many of the views with a hole are near enough to a reference to be distilled.
 
     Args:
         sds: Parameters of the SDS term.

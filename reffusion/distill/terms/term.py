@@ -20,13 +20,12 @@ from reffusion.types import Camera, Gaussians, Rendering
 
 
 class TermView(Protocol):
-    """The view on which a term is computed in one step: a training view or the hole of a reference.
-
-    It is a `TrainView` or a `ReferenceHole`.
-    """
+    """The view on which a term is computed in one step: a `TrainView` or a `ReferenceHole`."""
 
     @property
-    def camera(self) -> Camera: ...
+    def camera(self) -> Camera:
+        """Return the camera of the view."""
+        ...
 
 
 class TermValue(NamedTuple):
@@ -53,9 +52,13 @@ class TermValue(NamedTuple):
 class Stateful(Protocol):
     """An object that a term trains beside the Gaussians. Checkpoints contain its state, under the term's name."""
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state for a checkpoint."""
+        ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state that `state_dict` returned."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Term:
             step. It returns a `TermValue`. All other Gaussians get no gradient. It raises Degenerate if the view does
             not determine the loss; the loop counts such views and goes on.
         every: Number of steps from one computation of the term to the next.
-        fills_hole: Whether the term acts on masked Gaussians. Such a term is left out if there are none.
+        fills_hole: Whether the term acts on masked Gaussians. Such a term is left out if there are no masked Gaussians.
         uses_one_thread: Whether torch computes the term on one thread, which is faster if most of the work is
             rendering, or tensors are small.
         logs_gradient: Whether the norm of the term's gradient is logged. Such a term is computed before all others,
@@ -129,7 +132,7 @@ def cycle_through(views: Sequence[TrainView], seed: int, label: str) -> Callable
 
     Args:
         views: The views.
-        seed, label: With the number of the epoch they determine the order.
+        seed, label: The order within an epoch depends on both, and on the number of the epoch.
     """
     return lambda turn: views[seeding.epoch_index(turn, len(views), seed, "distill", label)]
 
