@@ -49,7 +49,7 @@ RESULTS = {
     "evaluate/side_by_side": "with the object, ground truth, result",
     "reference/references": "the references",
     "personalize/pytorch_lora_weights.safetensors": "LoRA of the prior",
-    "fit/gaussians.ply": "the scene with the object, normalised frame",
+    "fit/gaussians.ply": "the scene with the object, normalized frame",
 }
 
 

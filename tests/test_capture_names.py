@@ -40,7 +40,7 @@ from scenes.capture_checks import (
 def assert_points_near(scene, sentences: list[str], file: str) -> None:
     centers = np.stack([camera.center for camera in scene.cameras.values()])
     extent = np.linalg.norm(np.ptp(centers, axis=0))
-    assert extent > 0.1, "the normalised frame is as large as the other frame's points"
+    assert extent > 0.1, "the normalized frame is as large as the other frame's points"
     assert np.abs(scene.points - centers.mean(0)).max() < 100 * extent, "points of the other frame"
     assert_message(sentences, file, "not used")
 

@@ -231,7 +231,7 @@ def test_the_scene_is_exported_in_its_own_frame(finished_job):
     if (completed := finished_job / "finish-evaluate" / "completed" / "distill.ply").exists():
         result = load_ply(completed)
     back = SIMILARITY.apply(exported.means.double().numpy())
-    # 500 km from the origin, float32 resolves 0.03 units of the scene's own frame: 6e-4 in the normalised frame.
+    # 500 km from the origin, float32 resolves 0.03 units of the scene's own frame: 6e-4 in the normalized frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3
     sizes = exported.log_scales - result.log_scales
     assert torch.allclose(sizes, torch.full_like(sizes, -np.log(0.02)), atol=1e-5)

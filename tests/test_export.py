@@ -36,7 +36,7 @@ def random_scene_in_frame():
 
 
 def visible_gaussians(camera: Camera, degree: int = 2):
-    """Return 300 Gaussians in front of a camera, in the normalised frame."""
+    """Return 300 Gaussians in front of a camera, in the normalized frame."""
     made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
     pose = torch.from_numpy(camera.world_to_camera).float()
@@ -45,7 +45,7 @@ def visible_gaussians(camera: Camera, degree: int = 2):
 
 
 def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
-    """The exported .ply and cameras, which are in the scene's own frame, give the renderings of the normalised frame.
+    """The exported .ply and cameras, which are in the scene's own frame, give the renderings of the normalized frame.
 
     The cameras are read from the COLMAP model and from transforms.json.
     """
@@ -154,7 +154,7 @@ def test_export_writes_and_lists_all_files(tmp_path):
 
 
 def write_result(home: Path) -> tuple[Gaussians, Camera]:
-    """Write what `export` reads; return its Gaussians and a camera that sees them, in the normalised frame.
+    """Write what `export` reads; return its Gaussians and a camera that sees them, in the normalized frame.
 
     Their harmonics have a size as in captures: .spz stores values in [-1, 1], and .sog clusters them.
     """

@@ -40,9 +40,9 @@ SETTINGS = Params(
 
 
 def arc_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
-    """Return cameras on an arc that look at the origin from distance 1 in normalised units.
+    """Return cameras on an arc that look at the origin from distance 1 in normalized units.
 
-    The cameras' frame is the one in which the normalised point p has the coordinates p / scale + offset.
+    The cameras' frame is the one in which the normalized point p has the coordinates p / scale + offset.
     """
     cameras = []
     for k in range(count):
@@ -255,7 +255,7 @@ def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
 
 
 def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
-    """A scene in metres of a national grid, normalised by its similarity, is fitted like the scene at unit scale."""
+    """A scene in metres of a national grid, normalized by its similarity, is fitted like the scene at unit scale."""
     scale, offset = 1e-3, np.array([4.5e5, -3.2e4, 120.0])
     far = Similarity(scale, offset)
     cameras = [normalize_camera(c, far) for c in arc_cameras(scale=scale, offset=offset)]
@@ -377,7 +377,7 @@ def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
     save_ply(poses / "gaussians.ply", true_gaussians())
     stage.run(stage.Params(), out, poses=poses)
     assert torch.equal(load_ply(out / "gaussians.ply").means, true_gaussians().means)
-    assert "no optimisation" in plan.preview(stage.Params(), poses=poses)[0]
+    assert "no optimization" in plan.preview(stage.Params(), poses=poses)[0]
 
 
 def test_a_dense_start_looks_at_half_the_size_first():

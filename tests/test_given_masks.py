@@ -123,7 +123,7 @@ def test_masks_of_several_colors_are_refused(tmp_path):
     colors[50:60] = (0, 0, 255)
     Image.fromarray(colors).save(tmp_path / "x.png")
     assert refusal(tmp_path / "x.png") == (
-        "x.png: 2 colours beside black; write white where the object is, black elsewhere"
+        "x.png: 2 colors beside black; write white where the object is, black elsewhere"
     )
 
 
@@ -160,7 +160,7 @@ def test_object_numbers_count_where_they_are_opaque(tmp_path):
 
 def test_alpha_over_a_single_color_is_refused(tmp_path):
     with_alpha(np.full((HEIGHT, WIDTH, 3), 255, np.uint8)).save(tmp_path / "x.png")
-    assert "its alpha differs, its colours do not" in refusal(tmp_path / "x.png")
+    assert "its alpha differs, its colors do not" in refusal(tmp_path / "x.png")
 
 
 # -------------------------------------------------------------------------------------------------------- photographs

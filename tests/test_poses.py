@@ -338,7 +338,7 @@ def test_pictures_of_several_sizes_each_with_its_camera(tmp_path, layout):
 
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])
 def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, brings):
-    """A scene 1000 times larger, and millions of extents from the origin, has the same normalised cameras."""
+    """A scene 1000 times larger, and millions of extents from the origin, has the same normalized cameras."""
     monkeypatch.setattr(preparation, "LEAST_POINTS", 1)
     found = []
     for k, (scale, offset) in enumerate([(1.0, (0.0, 0.0, 0.0)), (1000.0, (4e9, -3e9, 1e9))]):
@@ -380,7 +380,7 @@ def test_random_points_are_seen_seeded_and_colored(tmp_path, monkeypatch):
     assert set(np.unique(scene.point_colors)) == set(range(40, 46))  # the gray levels of the six pictures
 
 
-def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
+def test_what_the_scene_brings_comes_into_the_normalized_frame(tmp_path):
     truth = make_truth(OPENCV, scale=5.0, offset=(50.0, 0.0, 0.0))
     folder = write_capture(tmp_path / "s", "colmap", truth)
     means = torch.from_numpy(truth.points).float()

@@ -225,6 +225,8 @@ def continue_depth(
     usable = view.known | view.anchored
     near = lambda fraction: morphology.dilate_by_distance(view.hole, fraction)
     surroundings, hole = usable & near(settings.ring), near(settings.margin)
+    if not surroundings.any():
+        raise geometry.Degenerate("few pixels", "no depth is known around the hole")
     planes = () if farthest else view.hints.planes
     label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
     surfaces = label()

@@ -49,5 +49,5 @@ def _values(path: Path) -> np.ndarray:
     with open_image(path, "a readable depth map") as image:
         mode, values = image.mode, np.array(image)
     if mode[0] not in "IF":
-        raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")
+        raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit gray, .npy or .exr")
     return values

@@ -117,7 +117,7 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
     if array.ndim == 3 and (array[..., :1] == array).all():
         array = array[..., 0]
     if array.ndim != 2:
-        raise BadInput(f"{path}: {image.mode} colours are no object numbers; save grey levels or a palette, or no `id`")
+        raise BadInput(f"{path}: {image.mode} colors are no object numbers; save gray levels or a palette, or no `id`")
     return np.isin(array, ids) & opaque
 
 
@@ -132,7 +132,7 @@ def _mark_by_picture(path: Path, image: Image.Image) -> np.ndarray:
     if not np.ptp(array[..., 3]):
         return _mark_by_colors(path, colors, lossless, palette)
     if (colors == colors[0, 0]).all():
-        raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
+        raise BadInput(f"{path}: its alpha differs, its colors do not; write 255 where the object is, 0 elsewhere")
     if opaque.any() and not _is_drawing(colors[opaque], lossless):
         return opaque
     return _mark_by_colors(path, colors * opaque[..., None], lossless, palette)
@@ -167,7 +167,7 @@ def _mark_by_colors(path: Path, colors: np.ndarray, lossless: bool, palette: boo
     if len(areas) > 1 and is_map and not is_gray:
         numbered = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if palette else ""
         raise BadInput(
-            f"{path}: {len(areas)} colours beside black; write white where the object is, black elsewhere{numbered}"
+            f"{path}: {len(areas)} colors beside black; write white where the object is, black elsewhere{numbered}"
         )
     if is_gray and (low < 0 or high < 128 or (len(areas) > 1 and is_map)):
         found = ", ".join(f"{number:g}" for number in (areas or [numbers.max()])[:6])

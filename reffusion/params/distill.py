@@ -65,7 +65,7 @@ class DepthTerm(Settings):
     every: int = Field(8, ge=1, description="steps between two evaluations of the depth term")
     # PAPER leaves open: the depth model, the unit of depth, and the sampler's steps.
     model: str | None = depth_model_field()
-    unit: float = Field(1, gt=0, description="the depth that counts as 1 in the loss, in the normalised frame's unit")
+    unit: float = Field(1, gt=0, description="the depth that counts as 1 in the loss, in the normalized frame's unit")
     steps: int = Field(20, ge=1, description="sampler steps from pure noise; a later start takes proportionally fewer")
 
 
@@ -173,7 +173,7 @@ class Params(Settings):
     prior: str = prior_field()
     prompts: Prompts = Prompts()  # as in `personalize`, which teaches the prior what they mean
     # PAPER leaves open: the number of iterations; 3DGS's own, less the fit's, is of this size.
-    iterations: int = Field(5000, ge=1, description="optimisation steps")
+    iterations: int = Field(5000, ge=1, description="optimization steps")
     sds: SdsTerm = SdsTerm()
     depth: DepthTerm = DepthTerm()
     adversarial: AdversarialTerm = AdversarialTerm()

@@ -75,7 +75,7 @@ class LearningRates(Settings):
 
 
 class Params(Settings):
-    iterations: int = Field(30_000, ge=1, description="optimisation steps, one view each (3DGS: 30000)")
+    iterations: int = Field(30_000, ge=1, description="optimization steps, one view each (3DGS: 30000)")
     sh: SphericalHarmonics = SphericalHarmonics()
     init: Init = Init()
     densify: Densify = Densify()

@@ -72,7 +72,7 @@ class TrainingSamples(Settings):
 class Params(Settings):
     prior: str = prior_field()
     prompts: Prompts = Prompts()
-    steps: int = Field(2000, ge=0, description="optimiser steps; 0 skips the stage: the prior is not adapted")
+    steps: int = Field(2000, ge=0, description="optimizer steps; 0 skips the stage: the prior is not adapted")
     # Not in the paper. Its 2,000 steps suit no reference in particular.
     least_gain: float = Field(
         0,

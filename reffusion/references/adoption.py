@@ -170,7 +170,7 @@ def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
     holes = agreement.refine_hole_depth(holes, references, space.remaining, hidden)
     for first, second, unlike in agreement.find_contradictions(references, holes):
         raise ValueError(
-            f"the references of '{first}' and '{second}' contradict each other: in what both show, colours differ by "
+            f"the references of '{first}' and '{second}' contradict each other: in what both show, colors differ by "
             f"{255 * unlike:.0f} of 255; make them alike, or give one of them"
         )
 

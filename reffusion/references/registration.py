@@ -98,7 +98,7 @@ class Registration:
             return "what it shows around the hole is too plain to be compared"
         moved = f"moved by up to {self.max_shift:.1f} px" if self.affine is not None else "not moved"
         brighter = (self.gain.mean() + self.offset.mean() - 1) * 100
-        colors = f"colours matched ({brighter:+.0f} %)" if (self.gain != 1).any() or self.offset.any() else "as exposed"
+        colors = f"colors matched ({brighter:+.0f} %)" if (self.gain != 1).any() or self.offset.any() else "as exposed"
         share = f"{self.inlier_ratio:.0%} of {self.point_count} places"
         return f"{moved}, {colors}; {share} around the hole lie as in the photograph"
 

@@ -16,4 +16,4 @@ def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str
         poses: folder of the stage `poses`; None if it has not run.
     """
     has_gaussians = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
-    return ["takes over the scene's gaussians.ply: no optimisation"] if has_gaussians else []
+    return ["takes over the scene's gaussians.ply: no optimization"] if has_gaussians else []

@@ -272,7 +272,7 @@ function drawObject() {
   $('masked').hidden = open || !masks;
   $('object').classList.toggle('marking', open);
   $('method').textContent = state.has_network ? 'Clicks: a segmentation network finds the object around a click.' :
-    'Clicks: colours and surfaces decide what belongs to the object. With the network that `make weights` fetches (37 MB) fewer clicks are enough.';
+    'Clicks: colors and surfaces decide what belongs to the object. With the network that `make weights` fetches (37 MB) fewer clicks are enough.';
   $('halted').hidden = !(open && state.awaits_fit && !isBusy() && !state.lost);
   if (open) {
     $('object-progress').replaceChildren();
@@ -472,7 +472,7 @@ function placePictures() {
   $('slider').querySelector('input').value = 1000 * line;
 }
 
-// Magnify about a point of the slider, in px; without one about its centre.
+// Magnify about a point of the slider, in px; without one about its center.
 function magnify(factor, point) {
   const box = $('slider').getBoundingClientRect(), [x, y] = point || [box.width / 2, box.height / 2];
   const before = zoom;
@@ -556,7 +556,7 @@ addEventListener('keydown', event => {
 function drawPaint() {
   const views = state.to_paint;
   $('paint-lead').textContent = views.length ?
-    'The grey part is what no photograph shows. Paint it here. Or download the picture, paint the grey part with any program without cropping the picture, and upload it. The next Start uses your picture.' :
+    'The gray part is what no photograph shows. Paint it here. Or download the picture, paint the gray part with any program without cropping the picture, and upload it. The next Start uses your picture.' :
     'Nothing has to be painted: the photographs show everything behind the object, or scene.yaml names a reference picture.';
   if (!changed('paint', [views, state.version])) return;
   $('paintings').replaceChildren(...views.map((each, k) => {
