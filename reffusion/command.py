@@ -70,7 +70,7 @@ def scene_path(text: str, root: Path) -> Path | None:
     """Return the folder or video that the name or path of a scene means, as an absolute path; None if there is none.
 
     Args:
-        text: a name under data/, or else a path.
+        text: a name under data/, or else a path; None is returned for an empty text.
         root: the result of `root()`.
     """
     places = (workplace(root) / "data" / text, Path(text).expanduser())
@@ -110,7 +110,8 @@ def installed_version() -> str:
 def main() -> None:
     """Run the command that the command line names; without a name, print the text of `--help`.
 
-    The process exits with status 2 if there is no command of this name, or if the command ends with an error message.
+    The process exits with status 2 if the name is unknown, or if the command exits with an error message. Such a
+    message is printed without a traceback.
     """
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help", "--version"):

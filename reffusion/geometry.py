@@ -136,6 +136,7 @@ def cameras_extent(cameras: Sequence[Camera]) -> float:
     """Return the extent of a scene as 3DGS defines it.
 
     This is 1.1 times the largest distance of a camera's center from the mean of all camera centers, in world units.
+    There must be at least one camera.
     """
     centers = np.stack([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())

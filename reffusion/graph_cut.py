@@ -11,14 +11,14 @@ HARD = 1e4  # cost that forbids a label, because no sum of the costs of pairs ex
 
 
 def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """Return bool [N], the labelling of N nodes with the smallest total cost, found by a minimum cut.
+    """Return bool [N], the labeling of N nodes with the smallest total cost, found by a minimum cut.
 
     The total cost is the sum of the costs of the nodes' labels and of the pairs whose nodes have different labels. It
-    is smallest up to rounding: costs are rounded to multiples of 1 / `UNIT`, and a strength above `HARD` counts as
+    is the smallest up to rounding: costs are rounded to multiples of 1 / `UNIT`, and a strength above `HARD` counts as
     `HARD`.
 
     Args:
-        true_cost, false_cost: [N], cost of labelling a node True or False. Only the difference of both matters, and a
+        true_cost, false_cost: [N], cost of labeling a node True or False. Only the difference of both matters, and a
             difference above `HARD` counts as `HARD`.
         pairs: [E, 2] int, indices of neighboring nodes, each pair once.
         strength: [E] >= 0, cost of a pair whose nodes have different labels.
@@ -40,7 +40,7 @@ def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, st
 
 
 def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return int [N] in [0, K), a labelling of N nodes with a low total cost, by expansion moves (Boykov et al. 2001).
+    """Return int [N] in [0, K), a labeling of N nodes with a low total cost, by expansion moves (Boykov et al. 2001).
 
     The total cost is that of `min_cut`, with K labels. An expansion move gives one label to the set of nodes for which
     this lowers the total cost most. The moves of all labels are repeated until none lowers the cost by more than
@@ -50,7 +50,7 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
         cost: [K, N] >= 0, cost of each label at each node.
         pairs: [E, 2] int, indices of neighboring nodes, each pair once.
         strength: [E] >= 0, cost of a pair whose nodes have different labels.
-        start: int [N], initial labels. They are not modified.
+        start: int [N], initial labels. This array is not modified.
     """
     labels, changed = start.copy(), True
     first, second = pairs.T
@@ -71,6 +71,6 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
 
 
 def _total(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, labels: np.ndarray) -> float:
-    """Return the total cost of a labelling."""
+    """Return the total cost of a labeling."""
     between = strength[labels[pairs[:, 0]] != labels[pairs[:, 1]]]
     return float(cost[labels, np.arange(len(labels))].sum() + between.sum())

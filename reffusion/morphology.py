@@ -16,12 +16,12 @@ def to_pixels(fraction: float, width: int) -> int:
 
 
 def disk(radius: int) -> np.ndarray:
-    """Return the structuring element of a disk, uint8 [2 radius + 1, 2 radius + 1]."""
+    """Return the structuring element of a disk, uint8 [2 radius + 1, 2 radius + 1], 1 inside; the radius is in px."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
 def square(radius: int) -> np.ndarray:
-    """Return the structuring element of a square, uint8 [2 radius + 1, 2 radius + 1]."""
+    """Return the structuring element of a square, uint8 ones [2 radius + 1, 2 radius + 1]; the radius is in px."""
     return np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
 
 
@@ -43,8 +43,8 @@ def dilate_by_distance(mask: np.ndarray, fraction: float) -> np.ndarray:
     Unlike `dilate`, this function takes the same time for any radius, so it suits large radii.
 
     Args:
-        fraction: the distance as a fraction of the image's width. It is not rounded to whole pixels: below one pixel
-            the mask stays the same.
+        fraction: the distance as a fraction of the image's width. The distance is not rounded to whole pixels, so a
+            distance below one pixel leaves the mask as it is.
     """
     if not mask.any():
         return mask

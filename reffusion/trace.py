@@ -85,7 +85,7 @@ class Checkpoints:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to write a checkpoint."""
+        """Whether a checkpoint is due."""
         return time.monotonic() - self._since > self._wait
 
     def save(self, state: Callable[[], dict[str, Any]]) -> None:
@@ -103,8 +103,8 @@ class Checkpoints:
 class Trace:
     """A writer of `trace.jsonl`, the error over time of a stage, one line per measurement.
 
-    docs/development.md#traces describes the lines. The time in the lines is the time of work since the stage began. It
-    excludes the time spent inside `with trace.pause():` and between an interruption and the resumed run.
+    docs/development.md#traces describes the lines. The time in the lines is the time of work since the stage began,
+    without the time spent inside `with trace.pause():` and between an interruption and the resumed run.
 
     Args:
         folder: the folder of the file.
@@ -168,7 +168,7 @@ def is_log_step(iteration: int, last: int, per_octave: int = 2, first: int = 1) 
 
     Args:
         iteration: number of finished steps.
-        last: number of the last step. Iterations 0, 1 and `last` are always measured; -1 if the last is unknown.
+        last: number of the last step, -1 if it is unknown. Iterations 0, 1 and `last` are always measured.
         per_octave: number of measurements while the iteration doubles.
         first: least iteration of the logarithmically spaced measurements.
     """
@@ -184,7 +184,7 @@ def steps_within_budget(
     """Return the number of steps that a stage can do in a time budget, from a twentieth of `max_steps` to `max_steps`.
 
     The speed is measured by a trial of `TRIAL_STEPS` steps, so the result depends on the machine and its load. The
-    result is written to `folder/length.json`. A resumed stage reads the result from this file, without a trial.
+    result is printed, and written to `folder/length.json`. A resumed stage reads it from this file, without a trial.
 
     Args:
         folder: the stage's folder.

@@ -1,6 +1,6 @@
 """The data types that the parts of the method exchange. They are frozen, use no inheritance, and do no IO.
 
-docs/architecture.md defines axes, units and names. The *normalised frame* is the scene's frame, scaled to an extent of
+docs/architecture.md defines axes, units and names. The *normalized frame* is the scene's frame, scaled to an extent of
 about 1 and shifted, see `Similarity`.
 """
 
@@ -73,7 +73,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Similarity:
-    """The map from the scene's own frame to the normalised frame: x_normalised = scale * (x_scene - offset).
+    """The map from the scene's own frame to the normalized frame: x_normalized = scale * (x_scene - offset).
 
     It has no rotation, so spherical harmonics stay the same.
 
@@ -86,17 +86,17 @@ class Similarity:
     offset: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Map points [..., 3] from the scene's own frame to the normalised frame, in float64."""
+        """Map points [..., 3] from the scene's own frame to the normalized frame, in float64."""
         return (np.asarray(points, np.float64) - self.offset) * self.scale
 
     def invert(self, points: np.ndarray) -> np.ndarray:
-        """Map points [..., 3] from the normalised frame to the scene's own frame, in float64."""
+        """Map points [..., 3] from the normalized frame to the scene's own frame, in float64."""
         return np.asarray(points, np.float64) / self.scale + self.offset
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The result of the `poses` stage: pinhole cameras and sparse points in the normalised frame.
+    """The result of the `poses` stage: pinhole cameras and sparse points in the normalized frame.
 
     Attributes:
         cameras: view name -> Camera, sorted by name; all views except the outliers.
@@ -105,7 +105,7 @@ class Scene:
             masked pixels, too.
         points: [P, 3] float64 sparse points.
         point_colors: [P, 3] uint8.
-        similarity: the map from the scene's own frame to the normalised frame.
+        similarity: the map from the scene's own frame to the normalized frame.
         camera_only: names of views that are neither training nor test views and have no photograph. They supervise
             nothing, but are completed and distilled.
         suspects: names of the views that are kept although their photographs contradict their poses.
@@ -127,10 +127,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N anisotropic 3D Gaussians, parametrised as in 3DGS.
+    """N anisotropic 3D Gaussians, parametrized as in 3DGS.
 
     Attributes:
-        means: [N, 3], in the normalised frame.
+        means: [N, 3], in the normalized frame.
         quaternions: [N, 4], wxyz, of any length (a zero quaternion is the identity).
         log_scales: [N, 3], natural logarithm of the standard deviations.
         opacity_logits: [N].
@@ -196,7 +196,7 @@ class MaskSet:
 
     Attributes:
         raw: True at the pixels of the object in the given 2D mask; all False if the view has no mask.
-        consistent: C, True at pixels that show the object, rendered from the Gaussians that are labelled as the object.
+        consistent: C, True at pixels that show the object, rendered from the Gaussians that are labeled as the object.
             The photograph must not supervise these pixels, unless the view is clean (`Scene.clean`): its photograph
             does not show the object there. In a view without a photograph, C also holds the pixels that no photograph
             of another view shows.
@@ -225,7 +225,7 @@ class Reference:
         depth: [H, W] float32, the depth map that the scene provides for this picture, NaN where unknown; None if it
             provides none. The values are depths or disparities with any scale and offset; `alignment.align_either`
             aligns them with the scene. Values that were depths in the unit of the scene are in the unit of the
-            normalised frame here.
+            normalized frame here.
     """
 
     camera: Camera

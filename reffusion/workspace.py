@@ -46,7 +46,7 @@ class Workspace:
 
     @cached_property
     def scene(self) -> Scene:
-        """Cameras and sparse points in the normalised frame."""
+        """Cameras and sparse points in the normalized frame."""
         return load_scene(self.poses)
 
     @cached_property
@@ -71,7 +71,7 @@ class Workspace:
 
     @cached_property
     def object_labels(self) -> Tensor:
-        """bool [N], True for the Gaussians of the object; debris is False."""
+        """bool [N], True for the Gaussians of the object, False for debris, which `labels` contains, too."""
         return load_object_labels(self.masks).to(self.device)
 
     @cached_property
@@ -135,7 +135,7 @@ class Workspace:
 
     @cached_property
     def ignored(self) -> dict[str, np.ndarray]:
-        """Pixels of photographs that neither train nor are filled (`load_ignored`)."""
+        """Training view -> bool [H, W], pixels that neither train nor are filled; only views that have such pixels."""
         return load_ignored(self.poses, self.scene.train)
 
     def remove_object(self, name: str) -> np.ndarray:
@@ -153,8 +153,8 @@ class Workspace:
     def background(self) -> Background:
         """The surroundings of the object as the photographs show them, with planes and mirrors.
 
-        It also has the object's center and radius. A mirror is a plane of mirror symmetry of a thing beside the object
-        (`background/mirrors.py`). They are searched here if `masks` had no use for them.
+        The result also has the object's center and radius. A mirror is a plane of mirror symmetry of a thing beside the
+        object (`background/mirrors.py`). Planes and mirrors are searched here if the stage `masks` did not save them.
         """
         arrays = load_arrays(self.masks / SURFACES)
         if "center" not in arrays:

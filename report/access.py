@@ -56,5 +56,5 @@ class Access:
         return f"{self.cookie}={self.token}; Path=/; Max-Age={COOKIE_SECONDS}; HttpOnly; SameSite=Strict"
 
     def _is_token(self, given: str) -> bool:
-        """Return whether a text is the token, in a time that does not depend on where they differ."""
+        """Return whether a text is the token, in a time that does not depend on where the two differ."""
         return secrets.compare_digest(given.encode(), self.token.encode())

@@ -86,6 +86,7 @@ def _picture(home: Path, scene: str) -> str:
 
 
 def main() -> None:
+    """Run `reffusion batch-page`: write the page of a batch, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion batch-page", description=__doc__.split("\n")[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--variant", default="", help="of the scenes")

@@ -144,6 +144,7 @@ def _left(kinds: list[str]) -> str:
 
 
 def _select(options: dict[str, str | None], chosen: str = "") -> str:
+    """Return an HTML list to choose from: value -> text to show, None for the value itself."""
     lines = [
         f'<option value="{escape(value)}"{" selected" if value == chosen else ""}>{escape(words or value)}</option>'
         for value, words in options.items()

@@ -78,7 +78,7 @@ def needs_log_axis(values: Iterable[float], factor: float = 12) -> bool:
 def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
     """Label a logarithmic axis, "x" or "y", with plain numbers (10, 100) instead of powers (10^1, 10^2).
 
-    Numbers in between (20, 50) are labelled too if the axis's current upper limit is less than 300 times the lower one.
+    Numbers in between (20, 50) are labeled too if the axis's current upper limit is less than 300 times the lower one.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

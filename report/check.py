@@ -22,7 +22,7 @@ TINT = (255, 0, 160)  # color of the training views' masks; masks for scoring te
 
 
 def make(home: Path) -> tuple[Path, list[str]]:
-    """Write check.png into a scene's run folder; return the path of the picture and the recorded warnings.
+    """Write check.png, the photographs with their masks, into a scene's run folder; return path and warnings.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>.
@@ -104,6 +104,7 @@ def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
 
 
 def main() -> None:
+    """Run `reffusion check`: write check.png, and print the recorded warnings and the path."""
     home = cli.run_folder(cli.scene_parser("check", __doc__).parse_args())
     try:
         path, warnings = make(home)

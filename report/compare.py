@@ -165,6 +165,7 @@ def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 
 
 def _cell(row: dict[str, Any], name: str) -> str:
+    """Return the cell of a method's row in the column `name` as text; scores with their interval."""
     digits = DIGITS.get(name, 0)
     return compare_tables.format_spread(row, name, digits) if name in SCORES else page.format_number(row[name], digits)
 
@@ -184,6 +185,7 @@ def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[
 
 
 def _signed(row: dict[str, Any], metric: str) -> str:
+    """Return a method's difference to the full method as text with its intervals; a dash if it is unknown."""
     mean, views, scenes = (row[f"{metric}_{what}"] for what in DIFFERENCE_COLUMNS)
     if mean is None:
         return "–"
@@ -327,6 +329,7 @@ def html(comparison: Comparison, table: list[dict], chart_paths: dict[str, Path 
 
 
 def main() -> None:
+    """Run `reffusion compare-page`: write table and page of a comparison; print the summary and the paths."""
     parser = argparse.ArgumentParser(prog="reffusion compare-page", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")

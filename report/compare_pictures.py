@@ -38,6 +38,7 @@ def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, 
 
 
 def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count: int) -> dict[str, Path]:
+    """Write sheets of at most `count` views of a scene, <prefix><view>.png; return {prefix + view: path}."""
     runs = [
         run for m in comparison.distinct_methods if (run := comparison.runs[m, scene]).state == "done" and run.views
     ]
@@ -55,6 +56,7 @@ def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count
 
 
 def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray]]:
+    """Return (title, picture cropped to the box) of the photograph and of each run, as far as they exist."""
     poses = first.folders.get("poses", Path())
     photo, views = poses / "images" / f"{view}.png", poses / "views.json"
     cells = []
@@ -70,6 +72,7 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
 
 
 def _title(run: Run, view: str) -> str:
+    """Return the name of the method and, in a second line, its scores in the view, if known."""
     row = run.views.get(view, {})
     scores = [f"{row['psnr_box']:.1f} dB"] if "psnr_box" in row else []
     perceptual = {"LPIPS": row.get("lpips_vgg_box"), "FLIP": row.get("flip_box")}

@@ -62,10 +62,12 @@ def view_shares(job: JobFiles) -> dict[str, tuple[float, float, float | None]]:
 
 
 def _mean(values: list[float]) -> float:
+    """Return the mean of at least one value."""
     return sum(values) / len(values)
 
 
 def _table(rows: list[tuple[str, tuple[float, float, float | None]]]) -> str:
+    """Return an HTML table of (view, its three shares), a row each."""
     lines = ["<tr>" + "".join(f"<th>{words}</th>" for words in HEADER) + "</tr>"]
     for name, shares in rows:
         cells = "".join(_bar(share) for share in shares)

@@ -109,7 +109,7 @@ def find_revision(key: str) -> str:
 
 
 def run_painter(key: str, case: Case) -> Result:
-    """Let an inpainter fill the hole, in this process. It raises what the inpainter raises."""
+    """Let an inpainter fill the hole in this process, and measure time and memory; raises what the inpainter raises."""
     began = time.monotonic()
     picture = _paint(key, case.image, case.hole)
     seconds, resident = time.monotonic() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -118,6 +118,7 @@ def run_painter(key: str, case: Case) -> Result:
 
 
 def _paint(key: str, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Return the picture whose hole the inpainter `key` has filled, uint8 [H, W, 3]."""
     if key == "telea":
         return classical.telea(image, hole)
     if key == "exemplar":
@@ -199,6 +200,7 @@ def examine(keys: list[str], case: Case, out: Path) -> int:
 
 
 def main() -> None:
+    """Run `reffusion doctor`; the process exits with status 1 if an inpainter fails or is implausible."""
     parser = argparse.ArgumentParser(prog="reffusion doctor", description=__doc__.partition("\n")[0])
     parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES), help="inpainters to examine")
     parser.add_argument("--out", type=Path, default=workplace(root()) / "runs" / "doctor.png", help="the sheet")

@@ -109,6 +109,7 @@ def viewer_caveats(path: Path, antialiased: bool) -> str:
 
 
 def main() -> None:
+    """Run `reffusion export`: write the finished scene in all formats, and print what was written."""
     parser = cli.scene_parser("export", __doc__)
     parser.add_argument("--sog", action="store_true", help="also write .sog and .html, by Node's npm (210 MB, minutes)")
     arguments = parser.parse_args()

@@ -1,7 +1,7 @@
 """Gaussians of a finished scene in three layers: kept, added and removed.
 
 *Kept* Gaussians belong to the fit and remain in the result. *Added* Gaussians fill the hole. *Removed* Gaussians are
-those that the stage `masks` labelled: the object, and debris that the object had hidden. The *states* of a scene are
+those that the stage `masks` labeled: the object, and debris that the object had hidden. The *states* of a scene are
 the initialization, snapshots during the distillation, and the result. Without distillation the result is the only
 state.
 """
@@ -26,12 +26,12 @@ SAME_DISTANCE = 1e-5  # in units of the scene's extent (1): Gaussians of two fil
 
 @dataclass(frozen=True)
 class GaussianLayers:
-    """Kept, added and removed Gaussians of a finished scene, in the normalised frame.
+    """Kept, added and removed Gaussians of a finished scene, in the normalized frame.
 
     Attributes:
         states: title of a state -> (kept Gaussians, added Gaussians), in order from the initialization to the result.
             Snapshots have the kept Gaussians of the result.
-        removed: Gaussians of the object; may be empty.
+        removed: Gaussians of the object, and debris; may be empty.
     """
 
     states: dict[str, tuple[Gaussians, Gaussians]]
@@ -56,7 +56,7 @@ def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
 
     Args:
         home: the folder.
-        similarity: transform from the scene's own frame to the normalised frame.
+        similarity: transform from the scene's own frame to the normalized frame.
 
     Raises:
         ValueError: the stage `evaluate` has not run.
@@ -93,13 +93,13 @@ def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
 
 
 def find_added(result: Gaussians, folder: Path) -> Tensor:
-    """Return bool [N], True for the Gaussians of the finished scene that a stage labelled as new.
+    """Return bool [N], True for the Gaussians of the finished scene that a stage labeled as new.
 
     Gaussians are matched by position, up to `SAME_DISTANCE`, because the stage `finish` removes and adds Gaussians.
     Those that `finish` adds around the capture (the backdrop) count as kept, i.e. are False.
 
     Args:
-        result: the N Gaussians of the finished scene, in the normalised frame.
+        result: the N Gaussians of the finished scene, in the normalized frame.
         folder: folder of the stage `distill` or `initialize`.
     """
     from scipy.spatial import cKDTree
@@ -112,7 +112,7 @@ def find_added(result: Gaussians, folder: Path) -> Tensor:
 
 
 def load_removed(home: Path, used: set[str], none: Gaussians) -> Gaussians:
-    """Load the removed Gaussians: those of the fit that the stage `masks` labelled.
+    """Load the removed Gaussians: those of the fit that the stage `masks` labeled.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>.

@@ -64,6 +64,7 @@ def picture_grid(cells: list[tuple[str, str]]) -> str:
 
 
 def _address(image: Image.Image, kind: str, **options: int | bool) -> str:
+    """Return the data URL of an image in a format of Pillow, such as "webp"."""
     written = io.BytesIO()
     image.save(written, kind, **options)
     return f"data:image/{kind};base64,{base64.b64encode(written.getvalue()).decode()}"

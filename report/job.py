@@ -132,7 +132,7 @@ def result_section(job: JobFiles) -> list[str]:
 def advice_section(job: JobFiles) -> list[str]:
     """Return the section on what would make the result better, and on what the capture lacks; may be empty.
 
-    It holds what the user can paint or mark (`verdict.give_advice`), notes on the frames of a video and on structure
+    It has what the user can paint or mark (`verdict.give_advice`), notes on the frames of a video and on structure
     from motion, and the warnings of all stages.
     """
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
@@ -260,6 +260,7 @@ def files_section(job: JobFiles) -> list[str]:
 
 
 def main() -> None:
+    """Run `reffusion report`: write the report of a scene, or of all scenes in a folder, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion report", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")

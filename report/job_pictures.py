@@ -151,6 +151,7 @@ def references_section(job: JobFiles) -> list[str]:
 
 
 def _facts(folder: Path) -> dict:
+    """Return the facts.json in the folder of a stage; {} without this file."""
     return load_json(folder / "facts.json") if (folder / "facts.json").is_file() else {}
 
 
@@ -224,7 +225,7 @@ def depth_section(job: JobFiles) -> list[str]:
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Render a depth map [H, W] of camera z, 0 where alpha is `MIN_ALPHA` or less."""
+    """Return a rendered depth map [H, W] of camera z, 0 where alpha is `MIN_ALPHA` or less."""
     rendering = rasterizer.render(gaussians, camera, sh_degree=0)
     return np.where(rendering.alpha.numpy() > MIN_ALPHA, rendering.depth.numpy(), 0.0)
 

@@ -23,6 +23,7 @@ def runner_options(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def main() -> None:
+    """Run `reffusion mask`: run the stages up to `raw_masks`, then serve the page until Ctrl-C."""
     parser = cli.scene_parser("mask", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     parser.add_argument("--profile", help="as for `run`, also for jobs that the page starts")

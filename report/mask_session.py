@@ -108,10 +108,12 @@ def file_digest(path: Path) -> str:
 
 
 def _relative_path(path: Path, folder: Path) -> str:
+    """Return a path as text, relative to `folder` if it lies inside."""
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
 def _saved_marks(folder: Path) -> dict:
+    """Return the content of clicks.json: "marks", and "written" (path of a mask -> hash of its file)."""
     return load_json(folder / CLICKS) if (folder / CLICKS).is_file() else {"marks": [], "written": {}}
 
 
@@ -174,7 +176,7 @@ class Session:
 
     @property
     def unsaved(self) -> bool:
-        """Whether the saved masks are not those of the present marks, or lack views that have a mask by now."""
+        """Whether marks have changed since the last save, or all views have masks now that were not all saved."""
         with self.lock:
             keys, complete = self.saved
             return keys != self._keys() or bool(keys and not complete and {*self.views} <= {*self.masks})
@@ -303,14 +305,14 @@ class Session:
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
             when the mask changes; None without a mask) and "given" (True if the mask is given); "first_view": the view
-            in which the object is probably easy to mark; "fit": True once the fit is loaded; "loading": True
-            if there is a fit that is not loaded yet; "can_undo": True if there
-            is something to undo; "busy": True while the masks do not yet follow the latest marks; "progress": share of
-            this computation that is done; "changes": views whose masks the last mark changed, as pairs of name and
-            share of the mask's pixels, the most changed first; "error": reason why the masks could not be computed, or
-            ""; "unsaved": as the property; "folder": folder of the masks; "network": name of the segmentation network,
-            or "". A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the background),
-            "radius", "size" and "effect" (share of its picture's pixels that it changed; None if that is not known).
+            in which the object is probably easy to mark; "fit": True once the fit is loaded; "loading": True if there
+            is a fit that is not loaded yet; "can_undo": True if there is something to undo; "busy": True while the
+            masks do not yet follow the latest marks; "progress": share of this computation that is done; "changes":
+            views whose masks the last mark changed, as pairs of name and share of the mask's pixels, the most changed
+            first; "error": reason why the masks could not be computed, or ""; "unsaved": as the property; "folder":
+            folder of the masks; "network": name of the segmentation network, or "". A mark has "index" (for `remove`),
+            "points", "sign" ("+" on the object, "-" on the background), "radius", "size" and "effect" (share of its
+            picture's pixels that the mark changed; None if that is not known).
         """
         with self.lock:
             views = [
@@ -351,17 +353,20 @@ class Session:
             }
 
     def _change(self, change: Callable[[list[Event]], list[Event]]) -> None:
+        """Replace the marks by `change(marks)`, so that `undo` can take the change back."""
         with self.lock:
             self.history.append(self.events)
             self._replace(change(self.events))
 
     def _replace(self, events: list[Event]) -> None:
+        """Replace the marks, and let the background thread compute the masks anew."""
         with self.lock:
             self.events, self.error = events, ""
             self.revision += 1
             self.lock.notify_all()
 
     def _keys(self) -> list[Hashable]:
+        """Return a key for each mark, in order; equal keys mean equal marks."""
         return [event.key for event in self.events]
 
     def _progress(self) -> float:
@@ -390,6 +395,7 @@ class Session:
         return self.sizes[name][0] / self.lenses[name].width
 
     def _encode(self, name: str) -> ImageFeatures:
+        """Return the features of a view for the segmentation network, which must exist."""
         assert self.segmenter is not None
         return encode_image(self.segmenter, self.images[name])
 
@@ -400,6 +406,7 @@ class Session:
             self.features_of(name)
 
     def _load_evidence(self, name: str) -> ViewEvidence:
+        """Return what the segmentation of a view uses: colors, features and, after the fit, surfaces."""
         features_of = lambda: self.features_of(name)
         return load_evidence(self.images[name], self.gaussians, self.scene.cameras[name], self.segmenter, features_of)
 
@@ -429,6 +436,7 @@ class Session:
                     self.lock.notify_all()
 
     def _load_fit(self) -> None:
+        """Load the fitted Gaussians, forget results from before the fit, and let the masks be computed anew."""
         gaussians = load_ply(self.capture.fit / "gaussians.ply")
         with self.lock:
             self.gaussians = gaussians

@@ -42,6 +42,7 @@ def document(title: str, body: Sequence[str], style: str = "", script: str = "")
 
 
 def heading(text: str, level: int = 2) -> str:
+    """Return an HTML heading of plain text."""
     return f"<h{level}>{escape(text)}</h{level}>"
 
 
@@ -56,10 +57,12 @@ def folded(title: str, parts: Sequence[str]) -> str:
 
 
 def paragraph(text: str, quiet: bool = False) -> str:
+    """Return an HTML paragraph of plain text; `quiet` is small and gray."""
     return f'<p class="quiet">{escape(text)}</p>' if quiet else f"<p>{escape(text)}</p>"
 
 
 def bullets(texts: Sequence[str]) -> str:
+    """Return an HTML list of plain texts; "" without texts."""
     return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>" if texts else ""
 
 
@@ -107,7 +110,7 @@ def code(line: str) -> str:
 
 
 def links(targets: dict[str, str]) -> str:
-    """Return an HTML list of links from {link text: relative address}."""
+    """Return an HTML list of links from {link text, plain: relative address}."""
     lines = [f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()]
     return "<ul>" + "".join(lines) + "</ul>"
 

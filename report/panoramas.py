@@ -28,7 +28,11 @@ def main() -> None:
 
 
 def make(scene: str, out: Path | None) -> str:
-    """Cut the panoramas of a folder or video; return a text to print.
+    """Cut the panoramas of a folder or video into views (`cut_panoramas`); return a text to print.
+
+    Args:
+        scene: name or path of the folder or video. The frames of a video are written to <out>-frames.
+        out: folder to write, which must not exist or be empty; None for <name of the scene>-views beside the scene.
 
     Raises:
         ValueError: the scene holds no panoramas, `out` is not empty, or the panoramas cannot be placed.

@@ -39,6 +39,7 @@ def make(home: Path) -> str:
 
 
 def main() -> None:
+    """Run `reffusion patch`: fill the hole of a scene or of two files of splats, and print what was written."""
     parser = cli.scene_parser("patch", __doc__, needs_scene=False)
     parser.add_argument("--only-check", action="store_true", help="only check that the scene says what was deleted")
     files = "two files of splats, before and after the object was deleted; the scene may be moved, turned and scaled"

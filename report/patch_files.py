@@ -78,6 +78,7 @@ def find_folder(runs: Path, before: Path, after: Path) -> Path:
 
 
 def _link(place: Path, file: Path) -> None:
+    """Make `place` a symbolic link to a file; a link or file at this place is replaced."""
     place.parent.mkdir(parents=True, exist_ok=True)
     if place.is_symlink() or place.exists():
         place.unlink()

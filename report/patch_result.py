@@ -27,10 +27,10 @@ class PatchResult:
     """Scene of Gaussians whose hole is filled, where the user left it in the editor.
 
     Attributes:
-        gaussians: all N Gaussians of the result, in the normalised frame, turned as the user turned the scene.
+        gaussians: all N Gaussians of the result, in the normalized frame, turned as the user turned the scene.
         similarity: from the frame of the user's file to that of `gaussians`.
         new: bool [N], True for the Gaussians that fill the hole.
-        deleted: number of Gaussians of the scene before that the user deleted, but for those that were cropped.
+        deleted: number of Gaussians that the user deleted, without those around the scene, which count as cropped.
         others: number of further Gaussians that were removed.
     """
 

@@ -198,6 +198,7 @@ def save_charts(personal: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
+    """Write the page of the measurements in a folder, and print its path."""
     parser = argparse.ArgumentParser(prog="report.prior", description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="what lab/studies/prior.py wrote to")
     try:

@@ -193,6 +193,7 @@ def load_view_scores(path: Path) -> dict[str, dict[str, float]]:
 
 
 def _number(column: str, text: str | None) -> float | None:
+    """Return a cell as a number, None if it is empty, no number or NaN; a PSNR is at most `PSNR_CAP`."""
     try:
         value = float(text or "")
     except ValueError:
@@ -234,6 +235,7 @@ def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _row(comparison: Comparison, method: str) -> dict[str, Any]:
+    """Return the row of a method without differences; of a duplicate only names, state and number of scenes."""
     done = comparison.finished_runs(method)
     states = [comparison.runs[method, scene].state for scene in comparison.scenes]
     row: dict[str, Any] = dict.fromkeys(COLUMNS)

@@ -96,7 +96,7 @@ def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[st
 
 
 def enlarge(picture: np.ndarray, scale: int) -> np.ndarray:
-    """Enlarge a picture without blur: repeat each pixel `scale` times in both directions."""
+    """Return a picture enlarged without blur: each pixel is repeated `scale` times in both directions."""
     return picture.repeat(scale, 0).repeat(scale, 1)
 
 
@@ -130,6 +130,7 @@ def compose_sheet(cells: Sequence[Sequence[np.ndarray | None]], titles: list[str
 
 
 def main() -> None:
+    """Run `reffusion sheet`: write the contact sheet of a finished scene, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion sheet", description=__doc__.split("\n")[0])
     parser.add_argument("scene", type=Path, help="runs/<scene>")
     parser.add_argument("--views", nargs="+", default=["3"], help="number of views, or their names")

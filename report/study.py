@@ -117,7 +117,7 @@ def _random_name(draws: torch.Generator) -> str:
 
 
 def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[tuple[str, list[tuple[Clip, Clip]]]]:
-    """Yield each scene's name with pairs of clips (full method, another method), without those that cannot be made."""
+    """Yield each scene's name with the pairs of clips (full method, another method) that can be made; may be empty."""
     for scene in comparison.scenes:
         runs = [comparison.runs[method, scene] for method in (FULL, *methods)]
         ours, *others = [run for run in runs if run.state == "done"] if runs[0].state == "done" else [runs[0]]
@@ -188,6 +188,7 @@ def _save_reference(run: Run, out: Path, name: str) -> str | None:
 
 
 def main() -> None:
+    """Run `reffusion study`: write the page, the clips and the key of a study, and print the path of the page."""
     parser = argparse.ArgumentParser(prog="reffusion study", description=__doc__.split("\n")[0])
     parser.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")
     parser.add_argument("--data", type=Path, help="a folder of scenes instead")

@@ -37,7 +37,7 @@ def write_table(record: Path) -> None:
 def table_rows(runs: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table: one row per scene, then one row of means.
 
-    All cells are text. A mean is over the scenes that are done and have a value.
+    All cells are text, "" for a missing value. A mean is over the scenes that are done and have a value.
 
     Args:
         runs: entries of the record.
@@ -51,6 +51,7 @@ def table_rows(runs: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
 
 
 def _cells(mean: dict[str, Any], names: list[str]) -> list[str]:
+    """Return the scores of these names as text, "" where one is missing."""
     values = (mean.get(name) for name in names)
     return [f"{value:.4f}" if isinstance(value, float) else "" if value is None else str(value) for value in values]
 

@@ -193,6 +193,7 @@ def draw_job_chart(
 def _errors(
     axes: Axes, curves: dict[str, tuple[str, np.ndarray]], ends: dict[str, tuple[float, float]], total: float
 ) -> None:
+    """Draw curves in dB, and points (seconds, PSNR) at the ends of stages; `total` is the job's seconds."""
     for (stage, (name, points)), color in zip(curves.items(), (BLUE, GREEN, ORANGE), strict=False):
         axes.plot(*points.T, color=color, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
@@ -209,6 +210,7 @@ def _errors(
 
 
 def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> None:
+    """Draw a bar for each stage from its begin, as long as its seconds."""
     total = sum(seconds.values())
     for row, (stage, value) in enumerate(seconds.items()):
         axes.barh(row, max(value, total / 500), left=begins[stage], color=GRAY, height=0.62)

@@ -124,6 +124,7 @@ def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> 
 
 
 def main() -> None:
+    """Run `reffusion turntable`: write the video, or that of before and after, and print its path."""
     parser = cli.scene_parser("turntable", __doc__)
     parser.add_argument(
         "--before-after", action="store_true", help="a video and an animated picture of before and after"

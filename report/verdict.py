@@ -12,7 +12,7 @@ from report.job_data import JobFiles
 MIN_INVENTION = 0.005  # share of the hole below which nothing counts as invented
 TO_PAINT = "to_paint"  # folder of the stage `reference` with the views worth painting
 MAX_ADVICE = 2  # most views that are named as worth painting
-LEAST_GAIN = 0.05  # share of the hole that a view must show to be worth painting
+LEAST_GAIN = 0.05  # share of the hole that a view must add to those before it to be worth painting
 RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a line of to_paint/ranked.txt
 
 
@@ -37,7 +37,7 @@ def describe_result(job: JobFiles) -> list[str]:
 
 
 def is_of_one_run(job: JobFiles) -> bool:
-    """Return whether the result and the filling were made from the stages that are on disk now."""
+    """Return whether the result and the filling were made from the results of stages that are on disk now."""
     return all(
         content is None or job.receipts.get(need, {}).get("output", content) == content
         for stage in ("evaluate", "initialize")
@@ -46,7 +46,7 @@ def is_of_one_run(job: JobFiles) -> bool:
 
 
 def give_advice(job: JobFiles) -> list[str]:
-    """Return how to make the result better: at most `MAX_ADVICE` views to paint, one sentence each."""
+    """Return how to make the result better: how to paint each of at most `MAX_ADVICE` views; may be empty."""
     folder = job.folders.get("reference", Path()) / TO_PAINT
     views = [(name, share) for name, share, is_painted in rank_views(job) if share >= LEAST_GAIN and not is_painted]
     return [
@@ -73,7 +73,7 @@ def describe_removal(job: JobFiles) -> str:
 def measure_invention(job: JobFiles) -> float | None:
     """Return the share in [0, 1] of the removed region that no photograph and no picture of the user shows.
 
-    It is the mean over views; None before the stage `initialize`.
+    The share is the mean over views; None before the stage `initialize`.
     """
     if "initialize" not in job.folders:
         return None
@@ -89,17 +89,21 @@ def is_reference_given(job: JobFiles) -> bool:
 
 
 def rank_views(job: JobFiles) -> list[tuple[str, float, bool]]:
-    """Return the views worth painting as (name, share of the hole that it shows, True if painted), the best first."""
+    """Return (view, share of the hole that it adds to the views before it, True if painted), painted ones first.
+
+    The views come from ranked.txt; the best of those that are not painted comes first. Empty without this file.
+    """
     path = job.folders.get("reference", Path()) / TO_PAINT / "ranked.txt"
     text = path.read_text(encoding="utf-8") if "reference" in job.folders and path.is_file() else ""
     return [(name, int(share) / 100, bool(painted)) for name, share, painted in RANKED.findall(text)]
 
 
 def view_to_paint(job: JobFiles) -> str | None:
-    """Return the name of the view whose painting would help most; None if none would help much."""
+    """Return the name of the first unpainted view that adds at least `LEAST_GAIN` of the hole; None without one."""
     return next((name for name, share, painted in rank_views(job) if not painted and share >= LEAST_GAIN), None)
 
 
 def _facts(job: JobFiles, stage: str) -> dict[str, Any]:
+    """Return the facts.json of a stage; {} if the stage is not done or has none."""
     path = job.folders.get(stage, Path()) / "facts.json"
     return load_json(path) if stage in job.folders and path.is_file() else {}

@@ -99,17 +99,19 @@ class Visitors:
         server.on_client_disconnect(lambda client: self._request_picture(client.client_id))
 
     def serve(self, client: Any) -> None:
+        """Render pictures for a new visitor, a client of viser, in a new thread until the visitor leaves."""
         self.requests[client.client_id] = threading.Event()
         threading.Thread(target=self._render_loop, args=(client,), daemon=True).start()
         client.camera.on_update(lambda _: self._request_picture(client.client_id))
         self._request_picture(client.client_id)
 
     def refresh(self) -> None:
-        """Render every visitor's picture anew."""
+        """Request a new picture for every visitor, which the visitor's thread renders."""
         for visitor in list(self.requests):
             self._request_picture(visitor)
 
     def _request_picture(self, visitor: int) -> None:
+        """Ask the thread of a visitor for a new picture; nothing happens if the visitor has left."""
         if visitor in self.requests:
             self.requests[visitor].set()
 
@@ -221,11 +223,13 @@ class Viewer:
         return picture
 
     def close(self) -> None:
+        """Stop the server and the rendering."""
         self.visitors.open = False
         self.server.stop()
 
 
 def _set_visible(things: list[Any], visible: bool) -> None:
+    """Show or hide objects of viser."""
     for thing in things:
         thing.visible = visible
 

@@ -102,6 +102,7 @@ def _preference(
 
 
 def _pair(key: dict[str, Any], trial: str) -> dict[str, str]:
+    """Return the entry of a pair of clips in the key; raises ValueError if there is none."""
     if trial not in key["pairs"]:
         raise ValueError(f"{trial}: no pair of this study")
     return key["pairs"][trial]
@@ -157,6 +158,7 @@ def preference_table(preferences: list[Preference]) -> str:
 
 
 def main() -> None:
+    """Run `reffusion study-votes`: print the table of preferences and the excluded participants."""
     parser = argparse.ArgumentParser(prog="reffusion study-votes", description=__doc__.split("\n")[0])
     parser.add_argument("answers", type=Path, nargs="+", help="files saved by the page")
     parser.add_argument("--key", type=Path, required=True, help="runs/X/study-key.json")
@@ -171,6 +173,7 @@ def main() -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    """Return the content of a file of answers; raises ValueError if it is no such file."""
     content = load_json(path)
     if not isinstance(content, dict) or not {"study", "participant", "answers"} <= set(content):
         raise ValueError(f"{path}: not a file of answers that the study's page saved")

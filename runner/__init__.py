@@ -50,5 +50,5 @@ OUTPUT: ContextVar[TextIO | None] = ContextVar("output", default=None)  # where 
 
 
 def say(text: str) -> None:
-    """Print a message to OUTPUT, which each thread may set for itself."""
+    """Print a message to the file in OUTPUT, which each thread may set for itself, or else to standard output."""
     print(text, file=OUTPUT.get(), flush=True)

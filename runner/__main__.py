@@ -24,6 +24,7 @@ from runner.worker import INTERRUPTED
 
 
 def main() -> int:
+    """Run the command of the command line; return its exit code: 2 for an error, INTERRUPTED after Ctrl-C."""
     arguments = _parser().parse_args()
     arguments.set = " ".join(arguments.set)
     root = arguments.root.resolve()
@@ -47,6 +48,7 @@ def main() -> int:
 
 
 def _plan(request: Request, arguments: argparse.Namespace) -> int:
+    """Print the plan of a stage and what it needs, or with --record write it to plan.json; return 0."""
     job = resolve(request)
     decisions = plan(job, job.pipeline.closure(arguments.stage))
     if arguments.record:
@@ -58,6 +60,7 @@ def _plan(request: Request, arguments: argparse.Namespace) -> int:
 
 
 def _run(request: Request, arguments: argparse.Namespace) -> int:
+    """Run a stage and what it needs, and print its results; return 0."""
     execution = Execution(cores=arguments.cores)
     if arguments.engine or arguments.address:
         request, execution = choose_engine(request, arguments)
@@ -70,6 +73,7 @@ _COMMANDS = {"plan": _plan, "run": _run} | COMMANDS
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Return the parser of the options of all commands of the runner."""
     parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
     parser.add_argument("command", choices=list(_COMMANDS))
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; default: all")

@@ -91,9 +91,10 @@ def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
 
 
 def recover_swap(home: Path, hashes: Hashes) -> None:
-    """Undo or finish the replacements of artifacts (`replace_artifact`) during which a runner was killed.
+    """Undo or finish what a killed runner had begun: replacements (`replace_artifact`) and deletions of artifacts.
 
-    If the new artifact is in place, the replacement is finished; else the old artifact is restored.
+    If the new artifact is in place, a replacement is finished; else the old artifact is restored. Deletions are
+    finished.
 
     Args:
         home: folder of a scene or variant in runs/.
@@ -110,7 +111,7 @@ def recover_swap(home: Path, hashes: Hashes) -> None:
 
 
 def _retire(old: Path, place: Path, hashes: Hashes) -> None:
-    """Delete an old artifact, if it exists, after moving out the files that people changed or added."""
+    """Delete an old artifact, if it exists, after moving out files that people changed or added; print moved names."""
     if not old.exists():
         return
     diff, kept = diff_artifact(old, hashes), place.parent / KEPT / place.name

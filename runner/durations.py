@@ -25,7 +25,7 @@ PRIOR_SECONDS = 60  # the table's own weight beside the receipts, as if a machin
 
 
 def receipts_of_variants(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
-    """Return the receipts of a stage in the scene's own run and in its variants, as far as there are any."""
+    """Return the existing receipts of a stage in the scene's own run and then in its variants."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     return [receipt for place in places if (receipt := read_receipt(place / stage))]
 
@@ -33,9 +33,9 @@ def receipts_of_variants(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
 def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     """Return the expected seconds of a stage; None if they are unknown.
 
-    They are those of the last run of this scene or a variant of it, on this machine and with this profile. Of a run
-    that was interrupted and resumed, that is the time of the last attempt alone. Before the first run they are those of
-    the table, times the slowness of this machine. If the job names a GPU, they are those of the table for this GPU.
+    If the job names a GPU, this is the time in the table for this GPU. Otherwise it is the time of the stage's last run
+    in this scene or a variant, on this machine and with this profile; of a resumed run only the last attempt counts.
+    Before the first run it is the time in the table, times the slowness of this machine.
     """
     typical = typical_seconds(job, stage)
     if job.gpu:
@@ -109,7 +109,7 @@ def seconds_by_stage(job: ResolvedJob, decisions: Mapping[str, Decision]) -> dic
 
 
 def format_total_time(seconds: Mapping[str, float | None]) -> str:
-    """Return the sum of seconds (stage -> seconds or None) as text, which names the stages without; "" if all are."""
+    """Return the total of stage -> seconds as text, with the names of stages of unknown time (None); "" if it is 0."""
     unknown = ", ".join(stage for stage, known in seconds.items() if known is None)
     total = sum(filter(None, seconds.values()))
     return (format_seconds(total) + (f" and the time of {unknown}" if unknown else "")) if total else ""

@@ -39,7 +39,7 @@ class Execution:
     """Settings for the execution of stages.
 
     Attributes:
-        engine: the engine that runs them.
+        engine: the engine that runs the stages.
         cores: number of cores of each stage. None for an equal part of the engine's cores if several scenes run; else
             for all cores of this machine, or for one core on a cluster.
         gpu_cores: number of cores of each stage that has a GPU; None for `cores`.
@@ -168,7 +168,9 @@ def _installed() -> dict[str, str]:
 def run_scene(
     request: Request, target: str, hashes: Hashes | None = None, execution: Execution | None = None
 ) -> dict[str, Path | None]:
-    """Run a stage of a scene and everything that it needs, as far as artifacts are not up to date. Prints the plan.
+    """Run a stage of a scene and the stages that it needs, as far as artifacts are not up to date. Prints the plan.
+
+    Also writes the profile and the source of the scene to its folder in runs/, and prints warnings of cached stages.
 
     Args:
         request: the scene and its options.
@@ -177,8 +179,8 @@ def run_scene(
         execution: settings; None for this machine with all its cores.
 
     Returns:
-        Stage -> folder of its artifact, or None if it is skipped; for the stages that it needs, in the order of
-        pipeline.yaml, and last the stage itself. A variant's folder may be that of the scene's own run.
+        Stage -> folder of its artifact, or None if the stage is skipped, for `target`, which comes last, and all stages
+        that `target` needs. A variant's folder may be that of the scene's own run.
 
     Raises:
         Refused: something that the user can correct is wrong or missing. Mostly this is raised before any stage runs.
@@ -216,7 +218,7 @@ def run_scene(
 
 
 def _plan_rest(job: ResolvedJob, stages: list[str], done: dict[str, Decision]) -> dict[str, Decision]:
-    """Plan the stages that are not done, and print this plan at the start and at the end, when none is pending."""
+    """Plan the stages not in `done`; print the plan if none is done or none is pending; raise Refused if one lacks."""
     planned = plan(job, stages, done)
     rest = {stage: decision for stage, decision in planned.items() if stage not in done}
     if not done or not any(decision.status == "pending" for decision in rest.values()):

@@ -67,7 +67,7 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; None if it cannot be read or is not valid JSON."""
+    """Read a JSON file; None if the file does not exist, cannot be read or is not valid JSON."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):

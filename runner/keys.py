@@ -162,7 +162,7 @@ def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
 
 
 def files_outside(files: Iterable[str], folder: Path) -> list[Path]:
-    """Return the normalised paths of those files that lie outside a folder. Links are not resolved.
+    """Return the normalized paths of those files that lie outside a folder. Links are not resolved.
 
     Args:
         files: paths, absolute or relative to `folder`.
@@ -173,7 +173,7 @@ def files_outside(files: Iterable[str], folder: Path) -> list[Path]:
 
 
 def fingerprint(tree: ast.Module) -> str:
-    """Hash Python code without its comments, docstrings, layout and descriptions of fields. Changes `tree`."""
+    """Hash Python code without comments, docstrings, layout and descriptions of fields; modifies `tree` in place."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
@@ -297,7 +297,7 @@ def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """Describe the differences but those of code between a receipt, `old`, and the current inputs, a phrase each.
+    """Return a phrase for each difference between a receipt, `old`, and the current inputs, except those of code.
 
     Parameters that do not change the artifact are not compared. An optional feature counts as a difference if the
     machine lacked it at the time of the receipt and has it now.
@@ -318,15 +318,16 @@ def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
 
 
 def _differing(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Return the keys with different values in two dicts, sorted; a value of None is as good as none."""
+    """Return the keys with different values in two dicts, sorted; a missing key counts as a value of None."""
     return [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
 
 
 def list_code_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """Describe which files of code differ between a receipt, `old`, and the current inputs, a phrase each."""
+    """Return a phrase for each file of code that differs between a receipt, `old`, and the current inputs."""
     return [f"code of {name} changed" for name in _differing(old["code"], new.code)]
 
 
 def _short(value: Any) -> str:
+    """Return a value as text of at most 40 characters."""
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 40 else text[:37] + "..."

@@ -50,6 +50,7 @@ class Condition(Strict):
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
+        """Raise ValueError unless exactly one of `fact`, `param` and `empty` is set."""
         if sum(map(bool, (self.fact, self.param, self.empty))) != 1:
             raise ValueError("a condition has one of `fact`, `param`, `empty`")
         return self
@@ -186,6 +187,7 @@ class Pipeline(Strict):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
+        """Raise ValueError if a stage or profile is unknown, a need is no earlier stage, or the budget exceeds 1."""
         earlier = [SCENE]
         for name, stage in self.stages.items():
             for need in (need for need in stage.depends_on if need not in earlier):
@@ -287,10 +289,10 @@ class SceneFile:
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
-    """Read the scene.yaml in a scene's folder; its content is empty if it does not exist.
+    """Read the scene.yaml in a scene's folder; the content is empty if there is no such file.
 
     Raises:
-        Refused: a key or stage is unknown, or a value has a wrong type.
+        Refused: the file cannot be read (`read_user_yaml`), a key or stage is unknown, or a value has a wrong type.
     """
     path = folder / "scene.yaml"
     content = read_user_yaml(path, typed=("stages",))

@@ -98,7 +98,7 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """Return the names of a stage's needs, `scene` included, without the one that its parameters make it ignore.
+    """Return the names of a stage's needs, `scene` included, without the need that the parameters say to ignore.
 
     For the ignored need see `pipeline.IgnoredNeed`.
     """

@@ -11,9 +11,9 @@ from runner.text import format_bytes, format_seconds, join_names
 def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     """Format a plan as text.
 
-    It has a line with the profile and the reason for it, a line per stage with status, expected time and reason, the
-    notes of the stages, the expected time of all that is to run, the weights to fetch, and the folders outside the
-    scene's folder from which files are read.
+    The text has a line with the profile and the reason for it, a line per stage with status, expected time and reason,
+    the notes of the stages, the expected time of all that is to run, the weights to fetch, and the folders outside
+    the scene's folder from which files are read.
     """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
     expected = seconds_by_stage(job, decisions)

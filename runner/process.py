@@ -135,8 +135,8 @@ def ask_stages(root: Path, questions: list[dict[str, Any]]) -> list[dict[str, An
 def run_process(task: Task, lock: int | None = None, should_stop: Callable[[], bool] | None = None) -> StageResult:
     """Run a task in a new process on this machine, and wait for its end.
 
-    An interrupt (Ctrl-C) is passed on to the process, which is killed if it has not ended after GRACE seconds. It is
-    not raised here, because the stage may have finished; see `StageResult.interrupted`.
+    An interrupt (Ctrl-C) is passed on to the process, which is killed if it has not ended after GRACE seconds. No
+    KeyboardInterrupt is raised, because the stage may have finished; see `StageResult.interrupted`.
 
     Args:
         task: the work.

@@ -153,7 +153,7 @@ def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) 
 
 
 def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[ResolvedJob]:
-    """Resolve several requests, which must have the same root, and return the jobs in the same order.
+    """Resolve at least one request, all of the same root, and return the jobs in the same order.
 
     All questions to stages whose answers are not in the cache are sent to one process. For the arguments and errors see
     `resolve`.

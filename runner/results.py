@@ -83,4 +83,5 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
 
 
 def _format_score(value: Any) -> str:
+    """Return a score as text, a float with four decimals."""
     return f"{value:.4f}" if isinstance(value, float) else str(value)

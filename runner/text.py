@@ -40,7 +40,7 @@ def format_seconds(seconds: float) -> str:
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Join the first three names by commas, and say how many more there are."""
+    """Return the first three names, separated by commas, and how many more there are; "" without names."""
     names = list(names)
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 

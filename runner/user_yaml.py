@@ -115,6 +115,7 @@ def _pairs(node: yaml.MappingNode) -> dict[str, yaml.Node]:
 
 
 def _is_null(node: yaml.Node) -> bool:
+    """Return whether a node is a null of YAML, such as `null`, `~` or nothing."""
     return isinstance(node, yaml.ScalarNode) and node.tag == NULL
 
 

@@ -1,4 +1,4 @@
-"""The stage `distill`: the initialization is optimised by the loss of RefFusion, section 4.
+"""The stage `distill`: the initialization is optimized by the loss of RefFusion, section 4.
 
 Its main terms are reconstruction, score distillation (SDS), depth and a critic; see docs/method.md#distillation.
 """
@@ -36,7 +36,7 @@ def run(
     initialize: Path,
     lift: Path | None = None,
 ) -> None:
-    """Run the stage: optimise the initialized Gaussians.
+    """Run the stage: optimize the initialized Gaussians.
 
     Writes gaussians.ply, labels.npy (bool [N], True for the masked Gaussians, which `initialize` added), facts.json,
     trace.jsonl and snapshots/ (the masked Gaussians at some steps). An interrupted run resumes from the checkpoint in

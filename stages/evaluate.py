@@ -106,7 +106,7 @@ def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> d
         folders: stage -> its folder; None if it was skipped.
 
     Returns:
-        Stage -> Gaussians in the normalised frame, without the skipped stages.
+        Stage -> Gaussians in the normalized frame, without the skipped stages.
     """
     gaussians = {}
     for stage, folder in folders.items():

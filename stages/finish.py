@@ -27,7 +27,7 @@ def run(
     The result is that of `distill`; if this stage was skipped, that of `initialize`; and if both were skipped, that of
     `fit`. With `params.backdrop`, planes go on beyond the training views, and a backdrop closes the scene. Gaussians
     that the scene brings get neither, because they may cover places that its views do not show. If they are added, the
-    result with them is also written in the normalised frame, as completed/<name of the stage that made it>.ply, and the
+    result with them is also written in the normalized frame, as completed/<name of the stage that made it>.ply, and the
     initialization with the same additions as completed/initialize.ply.
 
     Args:

@@ -35,7 +35,7 @@ from reffusion.types import Scene
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None) -> None:
     """Run the stage: fit Gaussians to the training views, without those that `params.holdout` reserves for evaluation.
 
-    Writes gaussians.ply (normalised frame), trace.jsonl and, if exposures are fitted, exposures.json. An interrupted
+    Writes gaussians.ply (normalized frame), trace.jsonl and, if exposures are fitted, exposures.json. An interrupted
     fit resumes from the checkpoint in `out`. If the scene brings Gaussians and `params.pixels` is "all", these become
     gaussians.ply and nothing is fitted.
 
@@ -91,8 +91,8 @@ def load_hidden_pixels(raw_masks: Path, scene: Scene) -> dict[str, np.ndarray]:
         raw_masks: folder of the stage `raw_masks`.
 
     Returns:
-        View name -> bool [H, W], True = the object. Views without a mask, and clean views (without the object), have no
-        entry.
+        View name -> bool [H, W], True = the object, i.e. does not supervise. Views without a mask, and clean views
+        (without the object), have no entry.
 
     Raises:
         ValueError: no view has a mask.

@@ -154,7 +154,7 @@ def load_marks(params: Params, scene: Scene, gaussians: Gaussians, poses: Path, 
 
 
 def load_region(raw_masks: Path) -> Region | None:
-    """Read the region in space that the scene names, in the normalised frame; None if it names none."""
+    """Read the region in space that the scene names, in the normalized frame; None if it names none."""
     path = raw_masks / "region.json"
     return Region(**load_json(path)) if path.exists() else None
 
@@ -216,7 +216,7 @@ def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera
 
     Args:
         poses, fit: folders of the stages of these names.
-        gaussians: in the normalised frame.
+        gaussians: in the normalized frame.
         train: the training views.
 
     Raises:

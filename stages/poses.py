@@ -1,4 +1,4 @@
-"""The stage `poses`: undistorted pictures, cameras and sparse points in the normalised frame, and roles of the views.
+"""The stage `poses`: undistorted pictures, cameras and sparse points in the normalized frame, and roles of the views.
 
 A role says whether a view is a training or a test view, clean (without the object), or a camera without pixels.
 """
@@ -46,20 +46,20 @@ SFM_FACTS = "sfm.json"  # file with the `facts` of `sfm.Reconstruction`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
-    """Run the stage: undistort the pictures, normalise the frame, and check the cameras.
+    """Run the stage: undistort the pictures, normalize the frame, and check the cameras.
 
     Writes:
 
     - images/<view>.png, the undistorted pictures, for each view that has one;
     - ignored/<view>.png, the pixels of these pictures that the scene ignores, if it has masks of such pixels;
-    - sparse/0/ (cameras and points, COLMAP), transform.json (normalised frame), views.json (roles) and lenses.json;
+    - sparse/0/ (cameras and points, COLMAP), transform.json (normalized frame), views.json (roles) and lenses.json;
     - sfm.json, if poses are estimated by structure from motion;
     - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
-    - gaussians.ply (normalised frame), if the scene brings Gaussians;
+    - gaussians.ply (normalized frame), if the scene brings Gaussians;
     - deleted.npy, bool [N], if it also brings a file from which a user deleted some of them: True for the deleted ones;
     - scattered.npy, bool [N], if some of the deleted ones stood alone and leave no hole: True for these;
     - cropped.npy, bool [N], if Gaussians around the scene were deleted, too: they stay until the result is written;
-    - added.ply (normalised frame), if the file has Gaussians that the scene had not;
+    - added.ply (normalized frame), if the file has Gaussians that the scene had not;
     - movement.json, if the user also scaled, turned or shifted the scene;
     - warnings.json, if something looks wrong.
 
@@ -109,7 +109,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write gaussians.ply in the normalised frame, and what the user did to it."""
+    """Write gaussians.ply in the normalized frame, and what the user did to it."""
     # The properties have the order of the scene's file.
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
     if (edit := own_splats.edit) is None:

@@ -66,7 +66,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """Write the scene's region as region.json in the normalised frame, or as masks of all beyond it if `outside`."""
+    """Write the scene's region as region.json in the normalized frame, or as masks of all beyond it if `outside`."""
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)

@@ -104,7 +104,7 @@ def describe_choice(view: str, candidates: Candidates) -> str:
 def describe_added_thing(reference: Reference) -> str | None:
     """Return a warning if the painted hole of a reference shows a thing of its own; None if not, or without a network.
 
-    The network is the distilled SAM of the click page.
+    The network is the distilled SAM of the click page. If its files cannot be read, the warning says so.
     """
     try:
         segmenter = load_distilled_sam(segmenter_cache())

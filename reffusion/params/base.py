@@ -30,14 +30,14 @@ def _kinds(annotation: Any) -> set[Any]:
 
 
 class Settings(BaseModel):
-    """A set of parameters. It cannot be changed after it is made, and names that it does not define are errors."""
+    """A set of parameters, which is immutable. Unknown names of parameters, infinity and NaN are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _as_meant(cls, value: Any, field: ValidationInfo) -> Any:
-        """Raise ValueError for a boolean in a field without booleans, and for a number in a field of text."""
+        """Return the value; raise ValueError for a boolean or a number in a field whose type does not allow it."""
         info = cls.model_fields[field.field_name]
         # YAML reads an unquoted `on` as true, which pydantic would silently turn into 1.
         if isinstance(value, bool) and bool not in _kinds(info.annotation):
@@ -52,6 +52,10 @@ class Settings(BaseModel):
 
         Args:
             values: dotted name of a parameter -> its new value, such as `{"sh.degree": 2}`.
+
+        Raises:
+            KeyError: a group in a dotted name does not exist.
+            ValueError: a parameter does not exist, or a value is not allowed (pydantic's ValidationError).
         """
         nested = self.model_dump()
         for name, value in values.items():
@@ -64,17 +68,19 @@ class Settings(BaseModel):
 
 
 def to_slashes(value: Any) -> Any:
-    """Return a string, or each string of a list, with slashes for backslashes. Other values, even a Path, stay."""
+    """Return a string, or a list with each string in it, with slashes for backslashes; other values are unchanged."""
     if isinstance(value, list):
         return [to_slashes(each) for each in value]
     return value.replace("\\", "/") if isinstance(value, str) else value
 
 
 def prior_field() -> Any:
+    """Return the field of a parameter that names the inpainting prior, whose weights enter the key."""
     return Field(PRIOR, description="inpainting prior: a diffusers folder or a hub id", json_schema_extra=WEIGHTS)
 
 
 def depth_model_field() -> Any:
+    """Return the field of a parameter that names the depth model; None by default."""
     return Field(
         None,
         description="depth model: a transformers folder or a hub id; none: depth is continued from the surroundings",
@@ -83,10 +89,12 @@ def depth_model_field() -> Any:
 
 
 def memory_field() -> Any:
+    """Return the field of the memory limit of the prior in GB; 0, the default, for no limit."""
     return Field(0.0, ge=0, description="memory limit of the prior in GB; batches are split to fit; 0: no limit")
 
 
 def means_unit_field() -> Any:
+    """Return the field of the unit of a learning rate of positions."""
     return Field(
         "distance",
         description="unit of that learning rate: the cameras' distance from the scene, or, as in the code of 3DGS, 1.1 "
@@ -95,17 +103,20 @@ def means_unit_field() -> Any:
 
 
 def seconds_field() -> Any:
+    """Return the field of the time budget of a stage in seconds; 0, the default, for none."""
     return Field(0.0, ge=0, description="time budget of the stage in seconds: as many steps as fit; 0: all steps")
 
 
 def checkpoint_field() -> Any:
+    """Return the field of the seconds of work between two checkpoints, which does not enter the key."""
     return Field(10.0, gt=0, description="seconds of work between checkpoints", json_schema_extra=UNKEYED)
 
 
 class Prompts(Settings):
     """The prompts with which a prior is adapted to a reference, and with which it then repaints views (section 4).
 
-    They stand for the reference only after an adaptation. A variant without one names what a scene is in plain words.
+    The default prompts stand for the reference only after the adaptation. A variant without an adaptation describes the
+    scene in plain words.
     """
 
     whole: str = Field("A photo of sks", description="prompt of whole views")

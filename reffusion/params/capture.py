@@ -25,6 +25,7 @@ class RegionSpec(Settings):
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
+        """Raise ValueError unless the region has one size and one place, and a radius if it is `outside`."""
         if (self.size is None) == (self.radius is None):
             raise ValueError("give either the size of a box, or the radius of a sphere")
         if (self.center is None) == (self.view is None) or (self.view is None) != (self.distance is None):
@@ -45,7 +46,7 @@ class MaskSpec(Settings):
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The values that mean the object, as a tuple; empty if `id` is None."""
+        """The pixel values that mean the object, as a tuple; empty if `id` is None: the object is then white."""
         return () if self.id is None else (self.id,) if isinstance(self.id, int) else tuple(self.id)
 
 
@@ -109,7 +110,7 @@ class SceneKeys(Settings):
 
     @property
     def has_masks(self) -> bool:
-        """Whether the scene may have masks: False if scene.yaml says `masks: none`."""
+        """Whether the scene may have masks: False only if scene.yaml says `masks: none`."""
         return (self.mask_folder or "").lower() != "none"
 
     @property

@@ -32,11 +32,11 @@ class SdsTerm(Settings):
     reaches: Literal["masked", "all"] = Field(
         "masked", description="Gaussians that SDS moves: masked ones, or all that show in the view"
     )
-    # The paper distils every view. A small prior knows little of views that are far from the reference it learnt.
+    # The paper distills every view. A small prior knows little of views that are far from the reference it learnt.
     max_angle: float = Field(
         180, gt=0, le=180, description="degrees; views farther than this from every reference are not distilled"
     )
-    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
+    # PAPER leaves open: timesteps, w(t), normalization, guidance, reduction (see `distill.sds`). The values are those
     # of threestudio, except guidance, which is RealFill's: a scale of 100 suits a prior that was not adapted.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     # Not in the paper: high timesteps decide the layout, which is settled first.
@@ -54,7 +54,7 @@ class SdsTerm(Settings):
 
     @property
     def is_on(self) -> bool:
-        """Whether SDS runs."""
+        """Whether SDS runs: its weight is positive and `run` is not "never"."""
         return self.weight > 0 and self.run != "never"
 
 

@@ -61,7 +61,7 @@ class Densify(Settings):
 
 
 class LearningRates(Settings):
-    """Adam's learning rates. They suit the normalised frame, in which cameras are about 1 from the scene."""
+    """Adam's learning rates. They suit the normalized frame, in which cameras are about 1 from the scene."""
 
     means: float = Field(1.6e-4, gt=0, description="initial learning rate of positions; the final one is 1/100 of it")
     means_unit: MeansUnit = means_unit_field()

@@ -74,6 +74,7 @@ class Inpainter(Settings, Generic[KindT]):
     @model_validator(mode="before")
     @classmethod
     def _from_kind(cls, value: Any) -> Any:
+        """Return {"kind": kind} for a kind as text, and an inpainter or a dict with a kind unchanged."""
         value = {"kind": value} if isinstance(value, str) else value
         if isinstance(value, Inpainter) or (isinstance(value, dict) and "kind" in value):
             return value
@@ -81,6 +82,7 @@ class Inpainter(Settings, Generic[KindT]):
 
     @model_validator(mode="after")
     def _has_what_its_kind_reads(self) -> Inpainter[KindT]:
+        """Raise ValueError if a parameter is set that the kind does not read, or one is missing that it needs."""
         defaults = {name: field.default for name, field in type(self).model_fields.items()}
         for name, kinds in KINDS_OF_PARAMETER.items():
             if getattr(self, name) != defaults[name] and self.kind not in kinds:
@@ -99,7 +101,7 @@ def split_command(command: str) -> list[str]:
     """Split a command into the program and its arguments, as a shell does.
 
     Raises:
-        ValueError: a quote is not closed, or a placeholder of `PLACEHOLDERS` is missing.
+        ValueError: a quote is not closed, or no argument contains one of `PLACEHOLDERS`.
     """
     try:
         words = shlex.split(command)

@@ -63,6 +63,7 @@ class Params(Settings):
 
     @model_validator(mode="after")
     def _refining_needs_a_network(self) -> Params:
+        """Raise ValueError if masks are to be refined and the segmenter is "none"."""
         if self.refine and self.segmenter == "none":
             raise ValueError("refine needs a segmentation network: leave out segmenter: none")
         return self

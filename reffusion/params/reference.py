@@ -48,7 +48,8 @@ class Params(Settings):
     def candidate_numbers(self) -> list[int]:
         """Return the numbers of the candidates that an inpainter of the kinds `SEED_KINDS` paints.
 
-        These are all, or only the one to choose, because each takes minutes. A command without {seed} paints one.
+        If `choose` is set, this is its number alone, because each candidate takes minutes. Otherwise the numbers go
+        from 0 to `candidates` - 1, but a command without {seed} paints only number 0.
         """
         count = 1 if self.inpainter.command and "{seed}" not in self.inpainter.command else self.candidates
         return list(range(count)) if self.choose is None else [self.choose]

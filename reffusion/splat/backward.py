@@ -134,7 +134,7 @@ def _load_tile(left, top, state, stride, images, gradients):
         for lane in range(min(TILE_WIDTH, width - left)):
             x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
             behind = transmittance[y, x]
-            # Upstream gradients are derivatives of the loss with respect to the blended sums of colour, depth and
+            # Upstream gradients are derivatives of the loss with respect to the blended sums of color, depth and
             # features. The rendered depth is D / alpha, where D is the blended sum. So the derivative with respect to D
             # is grad_depth / alpha, and -depth * grad_depth / alpha is added to grad_alpha.
             g_depth = grad_depth[y, x] / alpha[y, x] if alpha[y, x] > 0 else np.float32(0.0)

@@ -1,6 +1,6 @@
 """The constants of the splatting model, shared by its implementations (docs/method.md#splatting)."""
 
-NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalised frame
+NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalized frame
 LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is skipped at the pixels where its alpha is smaller
 MAX_ALPHA = 0.999  # larger alphas are clamped, with zero gradient; gsplat has the same value compiled in

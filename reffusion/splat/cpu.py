@@ -106,13 +106,14 @@ def _flat(parameters: list[np.ndarray], degree: int) -> footprints.Parameters:
 class _Splat(torch.autograd.Function):
     """Rendering as a differentiable function of the Gaussians, the features, the background and the probe.
 
-    It returns color, depth, alpha, features and radii. The radii have no gradient.
+    The results are color, depth, alpha, features and radii. The radii have no gradient.
     """
 
     @staticmethod
     def forward(
         ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree, antialias
     ):
+        """Return the five results; `probe` is [N, 2] or [0, 2], and `features` is [N, C], where C may be 0."""
         parameters = [_array(t) for t in (means, quaternions, log_scales, opacity_logits, sh)]
         view = project_and_bin(parameters, antialias, _array(probe), camera, degree)
         color, depth, alpha, blended, transmittance, used = forward.blend(
@@ -130,6 +131,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_color, grad_depth, grad_alpha, grad_blended, _):
+        """Return the gradients of the inputs of `forward`, None where no gradient is needed."""
         saved = [_array(t) for t in ctx.saved_tensors]
         parameters, features, images = saved[:5], saved[5], saved[6:]
         view, transmittance, used, numbers, center, degree = ctx.rest

@@ -1,4 +1,4 @@
-"""Kernels that work on Gaussians: footprints and colours, and the gradients of parameters from sums over pixels.
+"""Kernels that work on Gaussians: footprints and colors, and the gradients of parameters from sums over pixels.
 
 A *footprint* is a Gaussian projected into the image (columns: see `layout`). Kernels process groups of LANES
 consecutive Gaussians; `row` is the first Gaussian of a group.
@@ -51,7 +51,7 @@ from reffusion.splat.layout import (
 
 
 class Parameters(NamedTuple):
-    """Parameters of N Gaussians as flat arrays, and the format of their colours.
+    """Parameters of N Gaussians as flat arrays, and the format of their colors.
 
     Attributes:
         means, ..., sh: flat float32 arrays, in the order of `types.PARAMETERS`.
@@ -128,7 +128,7 @@ def project_gaussians(tickets, parameters, probe, view, center, footprints, radi
         parameters: `Parameters`.
         probe: [N, 2] flat, added to the 2D means, or empty.
         view: see `projection.view_numbers`.
-        center: [3], the camera centre.
+        center: [3], the camera center.
         footprints: [padded(N), FOOTPRINT] float32 flat, output.
         radii: [padded(N)] int32 zeros, output, the radii in pixels of the Gaussians that reach the image.
     """
@@ -302,7 +302,7 @@ def _rows_backward(row, is_visible, footprints, parameters, view, center, worksp
     last = parameters.opacity_logits.shape[0] - 1
     mean = projection.three_columns(parameters.means, row, last)
     _read_rows(parameters.sh, parameters.width, row, last, workspace.coefficients)
-    # Gradient of the mean through the viewing direction of the colours.
+    # Gradient of the mean through the viewing direction of the colors.
     x, y, z = _colors_backward(parameters.degree, mean, center, is_visible, footprints, row, workspace)
     _write_rows(gradients.sh, parameters.width, row, workspace.coefficients)
     to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
@@ -342,7 +342,7 @@ def _clear_rows(row, width, gradients):
 
 @inlined
 def _colors_backward(degree, mean, center, is_visible, footprints, row, workspace):
-    """Compute the gradients of the harmonics' coefficients and of the means from the gradients of the colours."""
+    """Return the gradient of the means through the colors; write that of the coefficients over the coefficients."""
     x, y, z, inverse = harmonics.direction(mean, center)
     zero, used = splat(0.0), 3 * (degree + 1) * (degree + 1)
     x, y, z = select(is_visible, x, zero), select(is_visible, y, zero), select(is_visible, z, zero)
@@ -380,7 +380,7 @@ def _store_zeros(array, width, row):
 
 @inlined
 def _color_gradient(moments, column, footprints, color, is_visible, row):
-    """Return the gradient of a colour channel; 0 where the colour is clamped at 0 and for invisible Gaussians."""
+    """Return the gradient of a color channel; 0 where the color is clamped at 0 and for invisible Gaussians."""
     # `color` is a column of a footprint, and `column` one of a record.
     free = is_visible & (load_column(footprints, FOOTPRINT, color, row, row + LANES - 1) > 0.0)
     return select(free, load(moments, column * LANES), splat(0.0))

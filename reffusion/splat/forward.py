@@ -49,7 +49,7 @@ from reffusion.splat.layout import (
 
 STEP_ROWS = LANES // TILE_WIDTH  # pixel rows per vector
 STEPS = TILE_HEIGHT // STEP_ROWS  # vectors per tile
-LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel centre of each lane, from the left
+LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel center of each lane, from the left
 _SUMS = 6  # vectors of the state per step, before features: transmittance, red, green, blue, depth, alpha
 
 # Constants, each as a vector with the same value in all lanes; then, for each step, the row of each of its pixels in
@@ -71,7 +71,7 @@ def blend(footprints, features, background, bins, width, height):
     Args:
         footprints: [>= N, FOOTPRINT] flat.
         features: [N, C].
-        background: [3], the colour behind everything.
+        background: [3], the color behind everything.
         bins: the tile lists, see `binning.Bins`.
         width, height: size of the image in pixels.
 
@@ -97,7 +97,7 @@ def or_none(features):
 
 @kernel
 def allocate_vectors(vectors):
-    """Return an uninitialised float32 array for this number of vectors, aligned to cache lines."""
+    """Return an uninitialized float32 array for this number of vectors, aligned to cache lines."""
     memory = np.empty(vectors * LANES + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
     return memory[first : first + vectors * LANES]
@@ -116,7 +116,7 @@ def next_tile(tickets, tiles):
     """Return the next tile to process, or -1 if all are taken.
 
     The tiles are divided into as many parts as there are threads, and tickets take one tile of each part in turn.
-    Otherwise threads would work on neighbouring tiles at once, and write to the same cache lines (of images, and of the
+    Otherwise threads would work on neighboring tiles at once, and write to the same cache lines (of images, and of the
     records of a footprint).
 
     Args:
@@ -204,7 +204,7 @@ def log_alpha(footprint, j):
 
 @inlined
 def exp2(x, constants):
-    """Return 2^x for x in [-126, 127], with a relative error of about 2e-7; outside it is undefined, without a trap.
+    """Return 2^x for x in [-126, 127], with a relative error of about 2e-7; for other x the result is undefined.
 
     x is divided into the nearest integer, which becomes the exponent, and a remainder, of which 2^x is a polynomial.
     """

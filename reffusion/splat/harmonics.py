@@ -1,4 +1,4 @@
-"""View-dependent colours of LANES Gaussians at a time by spherical harmonics, and their gradients.
+"""View-dependent colors of LANES Gaussians at a time by spherical harmonics, and their gradients.
 
 Directions point from the camera to the Gaussian. Arrays of harmonics, coefficients and their gradients are flat float32
 arrays with LANES values (one per Gaussian) for each number.
@@ -14,11 +14,11 @@ from reffusion.splat.conventions import SH0, SH1, SH2, SH3
 
 @inlined
 def direction(mean, center):
-    """Return the unit vectors from the camera centre to the means, and 1 / distance.
+    """Return the unit vectors from the camera center to the means, and 1 / distance.
 
     Args:
         mean: x, y and z of the means, three float64 vectors.
-        center: [3], the camera centre.
+        center: [3], the camera center.
 
     Returns:
         x, y and z of the unit vectors, and 1 / distance, as float32 vectors.
@@ -72,12 +72,12 @@ def colors(degree, basis, coefficients):
 
 @inlined
 def colors_backward(degree, basis, coefficients, red, green, blue, basis_gradient):
-    """Compute the gradients of the coefficients, which overwrite them, and of the harmonics.
+    """Write the gradients of the coefficients over the coefficients, and those of the harmonics to `basis_gradient`.
 
     Args:
         basis: Y_k, from `fill_basis`.
         coefficients: sh_k as for `colors`; output, dLoss/dsh_k.
-        red, green, blue: dLoss/dcolour; the caller sets them to 0 where the colour is clamped.
+        red, green, blue: dLoss/dcolor; the caller sets them to 0 where the color is clamped.
         basis_gradient: output, dLoss/dY_k.
     """
     for k in range((degree + 1) * (degree + 1)):
@@ -124,4 +124,5 @@ def direction_backward(degree, x, y, z, inverse, along):
 
 @inlined
 def _at(along, k):
+    """Return dLoss/dY_k as a vector."""
     return load(along, k * LANES)

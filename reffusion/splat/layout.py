@@ -19,7 +19,7 @@ ANCHOR_U, ANCHOR_V, HALF_WIDTH, HALF_HEIGHT, TILT, COLUMN, FOOTPRINT = range(10,
 MEMBER, ROWS, SLOT, ENTRY = 0, 1, 2, 4
 
 # Columns of a gradient record, which belongs to a pair of a footprint and a tile: the sums over the tile's pixels of
-# g = dLoss/d(ln alpha), and of g times u, v, uu, uv, vv; then the gradients of camera z, colour and, from GRAD_FEATURES
+# g = dLoss/d(ln alpha), and of g times u, v, uu, uv, vv; then the gradients of camera z, color and, from GRAD_FEATURES
 # on, features.
 SUM_G, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, GRAD_DEPTH, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_FEATURES = range(11)
 

@@ -60,7 +60,7 @@ def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
 def three_columns(array, row, last):
     """Return the three columns of LANES rows, from `row` on, of an array [R, 3] (flat), as float64 vectors.
 
-    `last` is the last row of the array; rows after it are replaced by it.
+    `last` is the last row of the array; it also stands for all rows after it.
     """
     return (
         widen(load_column(array, 3, 0, row, last)),
@@ -137,16 +137,19 @@ def _times_rotation(p, r):
 
 @inlined
 def _times_scales(e, scales):
+    """Return the product of a row and the diagonal matrix of `scales`."""
     return e[0] * scales[0], e[1] * scales[1], e[2] * scales[2]
 
 
 @inlined
 def _dot(a, b):
+    """Return the dot product of two rows of three vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def _cross(a, b):
+    """Return the cross product of two rows of three vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -213,10 +216,10 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
 def in_image(view, mean_x, mean_y, reach_x, reach_y):
     """Return a mask of the Gaussians whose box around alpha >= 1/255 touches the image.
 
-    Boxes with a centre beyond `MAX_PIXELS` are not in the mask.
+    Boxes with a center beyond `MAX_PIXELS` are not in the mask.
 
     Args:
-        mean_x, mean_y: centres of the boxes in pixels.
+        mean_x, mean_y: centers of the boxes in pixels.
         reach_x, reach_y: half widths and half heights of the boxes in pixels.
     """
     near_enough = (mean_x > -MAX_PIXELS) & (mean_x < MAX_PIXELS) & (mean_y > -MAX_PIXELS) & (mean_y < MAX_PIXELS)

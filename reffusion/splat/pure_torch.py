@@ -172,7 +172,7 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """Return the colours [N, 3] of the Gaussians as the camera sees them: max(0, 0.5 + sum_k Y_k(direction) sh_k).
+    """Return the colors [N, 3] of the Gaussians as the camera sees them: max(0, 0.5 + sum_k Y_k(direction) sh_k).
 
     Directions point from the camera to the Gaussians; `degree` is the degree of the spherical harmonics used.
     """
@@ -202,7 +202,7 @@ def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tens
 
     Args:
         projected: M Gaussians, front to back.
-        pixels: [P, 2], centres of the pixels.
+        pixels: [P, 2], centers of the pixels.
 
     Returns:
         The weights [P, M], alpha_k prod_{j<k} (1 - alpha_j), and the transmittance [P] behind all Gaussians.
@@ -223,7 +223,7 @@ def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tens
 
 
 def _pixel_chunks(camera: Camera, projected: Projected) -> tuple[Tensor, ...]:
-    """Return the pixel centres of the image in row-major order, in chunks [P, 2] of at most `_CHUNK` / M pixels."""
+    """Return the pixel centers of the image in row-major order, in chunks [P, 2] of at most `_CHUNK` / M pixels."""
     like = projected.means
     x = torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5
     y = torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5

@@ -26,14 +26,14 @@ def render(
     sh_degree: int | None = None,
     probe: Tensor | None = None,
 ) -> Rendering:
-    """Render Gaussians in one pass: colour, depth (divided by alpha), alpha and blended features, all differentiable.
+    """Render Gaussians in one pass: color, depth (divided by alpha), alpha and blended features, all differentiable.
 
     Args:
         gaussians: N Gaussians; N may be 0. Culled Gaussians (docs/method.md#splatting) get zero gradients.
         camera: the view, of size 1 x 1 or larger.
-        features: [N, C] values that are blended like colours, over a background of zeros, and not divided by alpha;
+        features: [N, C] values that are blended like colors, over a background of zeros, and not divided by alpha;
             differentiable. None: none.
-        background: [3] colour behind everything, black if None; differentiable.
+        background: [3] color behind everything, black if None; differentiable.
         impl: the implementation. "auto" selects "cuda" for tensors on a GPU, else "cpu". "torch" supports any dtype,
             such as float64, and any device.
         sh_degree: highest degree of spherical harmonics used, from 0 to the stored one; None: the stored one.

@@ -15,10 +15,11 @@ DIRECTIONS = 64  # in which rotated and original colors are made equal; degree 3
 
 
 def rotate_gaussians(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Return Gaussians rotated about the origin, on the CPU.
+    """Return Gaussians rotated about the origin: means, quaternions and harmonics.
 
     Args:
-        rotation: [3, 3].
+        gaussians: float32 on the CPU.
+        rotation: [3, 3]; a mean p becomes rotation @ p.
     """
     means = gaussians.means.double().numpy() @ rotation.T
     quaternions = rotate_quaternions(gaussians.quaternions.numpy(), rotation)

@@ -136,5 +136,6 @@ def _download_file(url: str, target: Path, sha256: str, size: int, name: str) ->
 
 
 def _one_line(error: BaseException) -> str:
+    """Return the message of an error, or its type without one, as one line of at most 120 characters."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 120 else text[:117] + "..."

@@ -31,10 +31,10 @@ class Need:
     """Weights that a stage needs, and whether they can be used on this machine.
 
     Attributes:
-        name: a hub id, a path, or a text for messages such as `LPIPS_NAME`. It tells `fetch` what to download.
+        name: a hub id, a path, or a text for messages such as `LPIPS_NAME`; `fetch` downloads what has this name.
         problem: why the weights cannot be used, in most cases with a remedy; None if they can be used.
         bytes: size of the weights, or of their download; None if unknown.
-        can_download: whether `make weights` can mend the problem by a download. It has no meaning without a problem.
+        can_download: whether `make weights` can mend the problem by a download; meaningless without a problem.
         optional: True if the stage works without the weights and reports what it leaves out.
         half: True if weights in half precision are sufficient.
         files: the only files of the hub model that are needed; empty for all that diffusers or transformers reads.
@@ -84,7 +84,7 @@ def pipeline_need(source: str | Path, dtype: str) -> Need:
 
 
 def _need(source: str | Path, dtype: str, check_folder: Callable[[Path], object]) -> Need:
-    """Return the need for a model whose folder, if it is on this machine, a function checks."""
+    """Return the need for a model; if its folder is on this machine, `check_folder` decides whether it is usable."""
     half, problem = dtype != "float32", None
     known = PUBLISHED.get(str(source))
     size = known.parameters * (2 if half else 4) if known else None
@@ -195,7 +195,7 @@ def hub_cache() -> Path:
 
 
 def is_id(source: str | Path) -> bool:
-    """Return True if `source` has the form of a hub id, owner/name. It may be a relative folder, too."""
+    """Return whether `source` has the form of a hub id, owner/name; a relative path may have this form, too."""
     return re.fullmatch(r"[A-Za-z0-9][\w.\-]*/[\w.\-]+", str(source)) is not None
 
 
@@ -227,7 +227,7 @@ def locate(source: str | Path) -> Path | None:
 
 
 def _snapshot(folder: Path) -> Path | None:
-    """Resolve an entry of the hub's cache to a snapshot: the one refs/main names, else the only one, else None."""
+    """Return a folder, or of an entry of the hub's cache the snapshot of refs/main, else the only one, else None."""
     if not (folder / "snapshots").is_dir():
         return folder
     main, snapshots = folder / "refs" / "main", sorted((folder / "snapshots").iterdir())
@@ -298,9 +298,9 @@ def check_pipeline(folder: Path) -> dict[str, Any]:
 
 
 def pipeline_parts(index: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """Return the parts that a model_index.json names, part -> (library, class), without those that only judge results.
+    """Return the parts that a model_index.json names and that are loaded, part -> (library, class).
 
-    A safety checker and its feature extractor are left out: they turn pictures black that they dislike.
+    Parts without a class, the image encoder, and the safety checker with its feature extractor are left out.
     """
     skipped = ("safety_checker", "feature_extractor", "image_encoder")
     named = {part: value for part, value in index.items() if isinstance(value, list) and len(value) == 2}
@@ -372,8 +372,7 @@ def _check_whole(path: Path) -> None:
 def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
     """Return the reason why a diffusion model cannot be used; None if it can.
 
-    Reasons are that it is no inpainting model, that its prediction type is not supported, or that its parts do not fit
-    together.
+    Reasons are: the model does not inpaint, its prediction type is not supported, or its parts do not fit together.
 
     Args:
         configs: part -> configuration, for "unet", "vae", "text_encoder", "scheduler", and for "text_encoder_2" if the

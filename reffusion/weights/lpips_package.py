@@ -79,6 +79,7 @@ class _ArraysOnly(pickle.Unpickler):
     """An unpickler that creates only NumPy arrays, so that a pickle cannot run code."""
 
     def find_class(self, module: str, name: str) -> Any:
+        """Return one of `_ALLOWED_CLASSES`; raise pickle.UnpicklingError for any other class."""
         if (module, name) not in _ALLOWED_CLASSES:
             raise pickle.UnpicklingError(f"{module}.{name} is no array")
         return super().find_class(module, name)

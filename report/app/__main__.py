@@ -12,6 +12,7 @@ from report.app.server import PORT, Server, announce
 
 
 def main() -> None:
+    """Run `reffusion app`: serve the page until Ctrl-C, and print its address."""
     parser = cli.scene_parser("app", __doc__, needs_scene=False)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()

@@ -34,7 +34,7 @@ class App:
         self.first = ""  # scene that the page shows at first
 
     def open(self, text: str) -> OpenScene:
-        """Open the scene that a name or a path means.
+        """Open the scene that a name or a path means, and compute its plan in the background.
 
         Raises:
             ValueError: there is none, or another scene of this name is open.
@@ -65,7 +65,7 @@ class App:
         return step
 
     def describe(self, scene: OpenScene) -> dict[str, Any]:
-        """Return the state of a scene, see `state.describe`."""
+        """Return the state of a scene, see `state.describe`, with "command", which the user typed."""
         return describe(scene, self.jobs, self.exports[scene.name]) | {"command": self.command}
 
     def begin_masks(self, scene: OpenScene) -> bool:

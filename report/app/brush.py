@@ -70,6 +70,7 @@ def _load_workspace(home: Path, masks: Path, changed: int) -> Workspace:
 
 
 def _to_png(image: np.ndarray) -> bytes:
+    """Return a picture, uint8 [H, W, 3], as PNG bytes."""
     file = BytesIO()
     Image.fromarray(image).save(file, "PNG", compress_level=1)
     return file.getvalue()

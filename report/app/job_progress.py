@@ -18,10 +18,10 @@ OVERDUE_SHARE = 0.1  # a stage that takes longer than expected is expected to ta
 def find_running_stage(home: Path, began: float) -> tuple[str, float]:
     """Return the stage that runs in a scene's folder, and the time at which it began; ("", 0) between stages.
 
-    A stage opens <stage>.log when it begins, and its last line there is the result.
+    A stage opens <stage>.log when it begins, and its last line there is the result. Times are in seconds since 1970.
 
     Args:
-        began: time at which the runner began.
+        began: time at which the runner began; older log files are not considered.
     """
     latest = max(home.glob("*.log"), key=lambda path: path.stat().st_mtime, default=None)
     if latest is None or latest.stat().st_mtime < began - 1:
@@ -40,7 +40,7 @@ def estimate_remaining(
 ) -> tuple[float | None, float | None]:
     """Return the share of a stage's seconds that is over and the seconds left; (None, None) if both are unknown.
 
-    The seconds that a progress bar predicts count the more the further it is: first steps tell little.
+    The further a progress bar is, the more the seconds that it predicts count, because first steps tell little.
 
     Args:
         elapsed: seconds since the stage began.
@@ -78,7 +78,7 @@ class ShownProgress:
     end: float | None = None
 
     def update(self, now: float, stage: str, share: float | None, left: float | None) -> dict[str, float | None]:
-        """Return what to show as {"share", "left", "whole"}, each None if it is unknown.
+        """Take in new estimates, and return what to show as {"share", "left", "whole"}, each None if it is unknown.
 
         Args:
             now: the time.
@@ -105,7 +105,7 @@ class ShownProgress:
 
 
 def find_bar(lines: list[str], stage: str) -> tuple[float, float] | None:
-    """Return the share done and the seconds left of a stage's progress bar in the last lines of a log."""
+    """Return the share done and the seconds left of a stage's bar in the last 3 lines of a log; None without one."""
     bars = [bar for line in lines[-3:] for bar in BAR.findall(line) if bar[0] == stage and int(bar[2])]
     return (int(bars[-1][1]) / int(bars[-1][2]), _read_clock(bars[-1][3])) if bars else None
 

@@ -56,7 +56,7 @@ class Plan:
         lacks_masks: True if the scene needs masks before the whole job can run.
         error: why there is no plan, or what the planned job lacks; "" if neither is the case.
         is_lost: True if the scene's folder or video was not there.
-        busy: True while it is being computed.
+        busy: True while the plan is being computed.
     """
 
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -84,9 +84,9 @@ class Jobs:
     # ------------------------------------------------------------------------------------------------ plans
 
     def plan(self, scene: OpenScene) -> Plan:
-        """Return the latest plan of a scene.
+        """Return the latest plan of a scene without waiting; the first plan is empty and `busy` at first.
 
-        It is computed in the background if there is none, or if the scene was moved away or back since.
+        A plan is computed in the background if there is none, or if the scene was moved away or back since.
         """
         plan = self.plans.get(scene.name)
         if plan is None or plan.is_lost == scene.source.exists():
@@ -94,7 +94,7 @@ class Jobs:
         return self.plans[scene.name]
 
     def renew_plan(self, scene: OpenScene) -> None:
-        """Compute the plan of a scene in the background."""
+        """Compute the plan of a scene in the background, unless this is being done."""
         with self.lock:
             plan = self.plans.setdefault(scene.name, Plan())
             if plan.busy:
@@ -103,6 +103,7 @@ class Jobs:
         threading.Thread(target=self._compute_plan, args=(scene, plan), daemon=True).start()
 
     def _compute_plan(self, scene: OpenScene, plan: Plan) -> None:
+        """Fill in `plan` by the runner; if the plan lacks masks, the runner plans again as if there were clicks."""
         plan.is_lost = not scene.source.exists()
         if plan.is_lost:
             plan.lacks_masks, plan.error, plan.stages = (
@@ -133,11 +134,12 @@ class Jobs:
         return lines[-1].removeprefix("error: ") if done.returncode else ""
 
     def _read_plan(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
+        """Return the stages of plan.json, stage -> entry; empty without this file."""
         path = scene.home / "plan.json"
         return load_json(path)["stages"] if path.is_file() else {}
 
     def quality(self, scene: OpenScene) -> str:
-        """Return the profile of the last plan; "" if it is none of `QUALITIES`, or if --profile fixes it."""
+        """Return the last plan's profile; "" without a plan, if it is none of `QUALITIES` or if --profile fixes it."""
         path = scene.home / "plan.json"
         profile = load_json(path).get("profile") if path.is_file() and "--profile" not in self.options else ""
         return profile if profile in QUALITIES else ""
@@ -167,6 +169,7 @@ class Jobs:
         return stages
 
     def _words(self, scene: OpenScene) -> tuple[str, ...]:
+        """Return the options of the runner for a scene: its source, the runs, the chosen profile and others."""
         chosen = self._profile_file(scene)
         profile = ("--profile", chosen.read_text()) if chosen.is_file() and "--profile" not in self.options else ()
         return ("--scene", str(scene.source), "--runs", str(self.runs), *profile, *self.options)
@@ -204,11 +207,12 @@ class Jobs:
         threading.Thread(target=self._await, args=(scene, process), daemon=True).start()
 
     def _await(self, scene: OpenScene, process: subprocess.Popen) -> None:
+        """Wait for the end of a job, and compute the plan anew."""
         process.wait()
         self.renew_plan(scene)
 
     def stop(self, scene: OpenScene) -> None:
-        """Interrupt the job that the page started; the next start goes on from its last checkpoint.
+        """Interrupt the job that the page started, without waiting for its end. The next start resumes the job.
 
         Raises:
             ValueError: there is no such job, or somebody else's runner holds the scene.
@@ -231,7 +235,7 @@ class Jobs:
         return list(running)
 
     def is_finished(self, scene: OpenScene, target: str) -> bool:
-        """Return whether the last job that this server started for the scene succeeded and included this target."""
+        """Return whether the last job that this server started for the scene succeeded with this target or "all"."""
         process, record = self.started.get(scene.name), self._read_record(scene)
         return process is not None and process.poll() == 0 and record.get("target") in (target, "all")
 
@@ -293,22 +297,26 @@ class Jobs:
         return {"stage": stage, "reason": reason, "done": sorted(done)} | numbers
 
     def expected_seconds(self, scene: OpenScene) -> dict[str, float]:
-        """Return stage -> expected seconds of the plan, for the stages that it would run; 0 where they are unknown."""
+        """Return stage -> expected seconds, 0 where they are unknown, for the stages that may run by the plan."""
         due = {stage: entry for stage, entry in self.plan(scene).stages.items() if entry["word"] not in FINAL}
         return {stage: entry.get("seconds") or 0.0 for stage, entry in due.items()}
 
     # ------------------------------------------------------------------------------------------------ files
 
     def _record(self, scene: OpenScene) -> Path:
+        """Return the file with the process and target of the last job that the page started."""
         return self.runs / RECORDS / f"{scene.name}.json"
 
     def _profile_file(self, scene: OpenScene) -> Path:
+        """Return the file with the profile that was chosen on the page; it may not exist."""
         return self.runs / RECORDS / f"{scene.name}.profile"
 
     def _log(self, scene: OpenScene) -> Path:
+        """Return the file to which jobs that the page starts print."""
         return self.runs / RECORDS / f"{scene.name}.log"
 
     def _read_record(self, scene: OpenScene) -> dict[str, Any]:
+        """Return {"process", "target"} of the last job that the page started; {} if none is recorded."""
         try:
             return load_json(self._record(scene))
         except (OSError, ValueError):

@@ -21,10 +21,10 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 
 
 def list_views(scene: OpenScene, job: JobFiles) -> list[dict[str, Any]]:
-    """Return the views worth painting, the best first.
+    """Return the views worth painting for which there is a template, in the order of `verdict.rank_views`.
 
     Returns:
-        For each view "view", its name; "share", the share of the hole in [0, 1] that it shows and better views do not;
+        For each view "view", its name; "share", the share of the hole in [0, 1] that it adds to the views before it;
         and "painted", the time of change of its painting in seconds, or None without one.
     """
     folder = scene.home / TO_PAINT

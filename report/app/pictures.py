@@ -84,7 +84,8 @@ def _load_or_render(scene: OpenScene, view: str, renders: str, gaussians: Path) 
 def draw_unsure(scene: OpenScene, view: str) -> bytes:
     """Return a transparent PNG that tints the pixels of a view which no photograph shows.
 
-    Blue is filled from a reference, orange from patches of photographs; red is not filled.
+    Blue is filled from a reference, orange from patches of photographs; red is not filled. Before the stage
+    `initialize` the whole invent mask is orange.
 
     Raises:
         KeyError: there is no such view.
@@ -107,6 +108,7 @@ def draw_unsure(scene: OpenScene, view: str) -> bytes:
 
 @lru_cache(KEPT)
 def _render(home: Path, view: str, path: Path, changed: int) -> np.ndarray:
+    """Render a view of a .ply file, uint8 [H, W, 3]; `changed` is the file's time of change, for the cache."""
     with RENDERING, torch.no_grad():
         scene, gaussians, exposures = _load_gaussians(home, path, changed)
         rendering = rasterizer.render(gaussians, scene.cameras[view])

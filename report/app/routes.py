@@ -60,6 +60,8 @@ def make_app(app: App, access: Access) -> Starlette:
 
 
 def _refuse(status: int) -> Callable[[Request, Exception], Response]:
+    """Return a handler that answers an error with its message, as JSON with this status."""
+
     def answer(request: Request, error: Exception) -> Response:
         text = error.args[0] if isinstance(error, LookupError) and error.args else str(error)
         return JSONResponse({"error": str(text)}, status)
@@ -101,25 +103,30 @@ class _Addresses:
         ]
 
     def send_file(self, request: Request) -> Response:
+        """Send a file of the page itself, one of `FILES`."""
         name, kind = FILES[request.url.path]
         return FileResponse(STATIC / name, media_type=kind)
 
     def list_scenes(self, request: Request) -> Response:
+        """Send the recent scenes, the scene to show at first, and the command that the user typed."""
         return JSONResponse(
             {"first": self.app.first, "scenes": list_recent(self.app.jobs.runs), "command": self.app.command}
         )
 
     async def open_scene(self, request: Request) -> Response:
+        """Open the scene at a path, and send its name."""
         content = await _read_json(request)
         scene = await run_in_threadpool(self.app.open, str(content["path"]))
         return JSONResponse({"name": scene.name})
 
     async def begin_upload(self, request: Request) -> Response:
+        """Begin a new scene with a wished name, and send the name that it gets."""
         upload = Upload(str((await _read_json(request))["name"]))
         self.app.uploads[upload.name] = upload
         return JSONResponse({"name": upload.name})
 
     async def receive_file(self, request: Request) -> Response:
+        """Receive a file of a new scene, and send the path of the scene."""
         name = request.path_params["upload"]
         if name not in self.app.uploads:
             raise LookupError("no such upload")
@@ -127,12 +134,15 @@ class _Addresses:
         return JSONResponse({"path": str(self.app.uploads[name].scene)})
 
     def send_state(self, request: Request) -> Response:
+        """Send the state of a scene."""
         return JSONResponse(self.app.describe(self._scene(request)))
 
     def send_events(self, request: Request) -> Response:
+        """Send the state of a scene whenever it changes, as a stream of events."""
         return StreamingResponse(_follow(self.app, self._scene(request)), media_type="text/event-stream")
 
     async def act(self, request: Request) -> Response:
+        """Do one of `ACTIONS` on a scene, and send what it returns."""
         scene, content = self._scene(request), await _read_json(request)
         action = ACTIONS.get(request.path_params["action"])
         if action is None:
@@ -140,6 +150,7 @@ class _Addresses:
         return JSONResponse(await run_in_threadpool(action, self.app, scene, content) or {})
 
     async def show_live(self, request: Request) -> Response:
+        """Start the 3D viewer of a scene, and send its port; an unfinished or running job is followed."""
         scene, viewer = self._scene(request), self.app.viewer
         running = self.app.jobs.state(scene)["state"] in ("running", "elsewhere")
         follow = running or not tasks.has_result(scene)
@@ -156,10 +167,12 @@ class _Addresses:
         return Response(content, media_type="image/png" if content[:4] == b"\x89PNG" else "image/jpeg", headers=headers)
 
     def send_template(self, request: Request) -> Response:
+        """Send the picture over which a user can paint a view."""
         scene, view = self._scene(request), self._view_to_paint(request)
         return FileResponse(scene.home / verdict.TO_PAINT / f"{view}.png", filename=f"{view}.png")
 
     async def receive_painting(self, request: Request) -> Response:
+        """Save a painting of a view, and compute the plan anew; with replace=1 over an earlier painting."""
         scene, view = self._scene(request), await run_in_threadpool(self._view_to_paint, request)
         content = await read_body(request, painting.PICTURE_BYTES)
         replace = request.query_params.get("replace") == "1"
@@ -168,6 +181,7 @@ class _Addresses:
         return JSONResponse({})
 
     def send_painting(self, request: Request) -> Response:
+        """Send the painting of a view; raises LookupError if there is none."""
         scene, view = self._scene(request), self._view_to_paint(request)
         path = painting.painting_path(scene, view)
         if not path.is_file():
@@ -175,10 +189,12 @@ class _Addresses:
         return FileResponse(path)
 
     def send_canvas(self, request: Request) -> Response:
+        """Send the view without the object, filled as by the job."""
         scene, view = self._scene(request), self._view_to_paint(request)
         return Response(brush.draw_canvas(scene, view), media_type="image/png")
 
     async def fill(self, request: Request) -> Response:
+        """Send the received picture with its transparent part filled with patches of the photographs."""
         scene, view = self._scene(request), await run_in_threadpool(self._view_to_paint, request)
         content, seed = await read_body(request, painting.PICTURE_BYTES), request.query_params.get("seed", "0")
         if not re.fullmatch(r"\d{1,9}", seed):
@@ -187,14 +203,17 @@ class _Addresses:
         return Response(filled, media_type="image/png")
 
     def send_export(self, request: Request) -> Response:
+        """Send an exported file for download, under the name <scene>-<file>."""
         scene = self._scene(request)
         path = tasks.find_export(scene, request.path_params["file"])
         return FileResponse(path, filename=f"{scene.name}-{path.name}")
 
     def _scene(self, request: Request) -> OpenScene:
+        """Return the open scene that an address names; raises LookupError if there is none."""
         return self.app.scene(request.path_params["scene"])
 
     def _view_to_paint(self, request: Request) -> str:
+        """Return the view that an address names; raises LookupError if it is not one of those to paint."""
         view = request.path_params["view"]
         if view not in [each["view"] for each in list_views_to_paint(self._scene(request))]:
             raise LookupError("no such view to paint")
@@ -202,22 +221,27 @@ class _Addresses:
 
 
 def _begin_masks(app: App, scene: OpenScene, content: dict[str, Any]) -> dict[str, Any]:
+    """Begin the mask step; return {"open": whether it is open}."""
     return {"open": app.begin_masks(scene)}
 
 
 def _start(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
+    """Start the whole job of a scene."""
     app.jobs.start(scene, "all")
 
 
 def _choose_quality(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
+    """Save `content["profile"]` as the profile of a scene."""
     app.jobs.choose_quality(scene, str(content.get("profile")))
 
 
 def _stop(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
+    """Interrupt the job of a scene."""
     app.jobs.stop(scene)
 
 
 def _export(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
+    """Start the export of a scene, with .sog and .html if `content["sog"]` is True."""
     app.exports[scene.name].start(scene, content.get("sog") is True)
 
 
@@ -231,6 +255,7 @@ ACTIONS: dict[str, Callable[[App, OpenScene, dict[str, Any]], dict[str, Any] | N
 
 
 async def _read_json(request: Request) -> dict[str, Any]:
+    """Return the body of a request, a JSON object; raises ValueError if it is something else."""
     content = json.loads(await read_body(request) or b"{}")
     if not isinstance(content, dict):
         raise ValueError("a JSON object is expected")

@@ -39,7 +39,7 @@ class OpenScene:
         return self.home / FRAMES if self.source.suffix.lower() in VIDEOS and not self.source.is_dir() else self.source
 
     def pictures(self) -> dict[str, Path]:
-        """Return view name -> photograph: undistorted as soon as `poses` has run, until then as captured.
+        """Return view name -> photograph: undistorted once `poses` has run, else as captured; {} without a folder.
 
         Raises:
             ValueError: the folder is no capture.
@@ -62,10 +62,10 @@ def _captured(folder: Path, changed: int) -> dict[str, Path]:
 
 
 def find_scene(text: str, runs: Path) -> OpenScene:
-    """Return the scene that a name or a path means.
+    """Return the scene that a name or a path means, also a finished scene whose folder or video is no longer there.
 
     Raises:
-        ValueError: there is no folder or video there, or it holds nothing to read.
+        ValueError: there is no such scene, or a file that is no video, or a folder without photographs.
     """
     source = scene_path(text.strip(), root()) or _find_lost(text.strip(), runs)
     if source is None:
@@ -80,6 +80,7 @@ def find_scene(text: str, runs: Path) -> OpenScene:
 
 
 def _holds_capture(folder: Path) -> bool:
+    """Return whether a folder has a scene.yaml, a capture of a known layout, or photographs."""
     if (folder / "scene.yaml").is_file() or detect_layout(folder) != "photos":
         return True
     places = (folder, *(folder / name for name in ("images", "photos", "input")))
@@ -100,6 +101,7 @@ def _list_homes(runs: Path) -> dict[Path, Path]:
 
 
 def _is_finished(home: Path) -> bool:
+    """Return whether the stage `evaluate` of a scene has finished."""
     return (home / "evaluate" / "receipt.json").is_file()
 
 

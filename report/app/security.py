@@ -69,6 +69,7 @@ class OwnPageOnly:
         await self.app(scope, receive, send_with_headers)
 
     def _is_local(self, headers: Headers) -> bool:
+        """Return whether a request names this server as its host and, if it names one, as its origin."""
         origin = headers.get("origin")
         return headers.get("host") in self.hosts and (origin is None or urlsplit(origin).netloc in self.hosts)
 

@@ -71,6 +71,7 @@ class Server:
             self.app.close()
 
     def stop(self) -> None:
+        """Let `serve` return soon. May be called from any thread."""
         self.server.should_exit = True
 
 

@@ -144,4 +144,5 @@ def _version(home: Path) -> int:
 
 @lru_cache(4)
 def _load_job(home: Path, version: int) -> JobFiles:
+    """Load the job of a scene; `version` is the result of `_version`, by which the job is cached."""
     return load_job(home)

@@ -82,14 +82,14 @@ class Viewer:
         self.lock = threading.Lock()
 
     def show(self, scene: OpenScene, follow: bool, access: Access) -> None:
-        """Start the viewer of a scene, unless it runs already.
+        """Start the viewer of a scene, unless it runs already, and wait until it listens. Another viewer is stopped.
 
         Args:
             access: the token of the page, which the viewer asks for, too.
             follow: True shows the latest state of an unfinished job, and reloads when there is a newer one.
 
         Raises:
-            ValueError: it cannot start; the message has the remedy.
+            ValueError: the viewer cannot start; the message has the remedy.
         """
         with self.lock:
             alive = self.process is not None and self.process.poll() is None
@@ -125,10 +125,12 @@ class Viewer:
             raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
 
     def stop(self) -> None:
+        """End the viewer, if it runs."""
         with self.lock:
             self._stop()
 
     def _stop(self) -> None:
+        """End the viewer, if it runs; the caller holds the lock."""
         if self.process is not None and self.process.poll() is None:
             self.process.kill()
             self.process.wait()
@@ -153,7 +155,7 @@ class Export:
         self.unfinished: frozenset[str] = frozenset()
 
     def start(self, scene: OpenScene, sog: bool) -> None:
-        """Start in the background, unless it runs already.
+        """Start the export in the background, unless it runs already.
 
         Args:
             sog: True also makes a .sog and an .html file, which takes Node and minutes.
@@ -164,11 +166,12 @@ class Export:
             threading.Thread(target=self._run, args=(scene, sog), daemon=True).start()
 
     def describe(self) -> dict[str, Any]:
-        """Return "work", "share" and "error"; and "has_npm", True if these can be made on this machine."""
+        """Return "work", "share", "error" (see the class) and "has_npm": whether .sog and .html can be made here."""
         has_npm = shutil.which("npm") is not None
         return {"work": self.work, "share": self.share, "error": self.error, "has_npm": has_npm}
 
     def _run(self, scene: OpenScene, sog: bool) -> None:
+        """Do all works of `EXPORTS`; `work`, `share`, `unfinished` and `error` tell the progress."""
         cameras = scene.home / "export" / "cameras"
         try:
             for k, (words, work) in enumerate(EXPORTS.items(), start=1):
@@ -183,7 +186,7 @@ class Export:
             self.work, self.unfinished = "", frozenset()
 
     def _do(self, command: list[str]) -> None:
-        """Run a command, read its progress, and keep the last line that it prints if it fails."""
+        """Run a command, and keep its progress in `share` and, if it fails, its last line in `error`."""
         with subprocess.Popen(
             command, env=make_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         ) as process:
@@ -197,7 +200,7 @@ class Export:
 
 
 def list_exports(scene: OpenScene, unfinished: Collection[str] = ()) -> dict[str, dict[str, object]]:
-    """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out.
+    """Return the files to download, as name without folder -> {"words", "bytes"}, without files older than the result.
 
     Args:
         unfinished: files of `FILES` that are being written, which are left out, too.

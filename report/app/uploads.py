@@ -84,6 +84,7 @@ class Upload:
 
 
 async def _write(path: Path, parts: AsyncIterator[bytes], limit: int) -> None:
+    """Write the received parts to a file; raises TooLarge if they have more than `limit` bytes."""
     size = 0
     with open(path, "wb") as file:
         async for part in parts:
@@ -94,6 +95,7 @@ async def _write(path: Path, parts: AsyncIterator[bytes], limit: int) -> None:
 
 
 def _check_picture(path: Path, name: str) -> None:
+    """Raise ValueError, which names the user's file `name`, if a file is no picture that can be decoded."""
     try:
         load_thumbnail(path, 64)
     except ValueError as error:
@@ -101,6 +103,7 @@ def _check_picture(path: Path, name: str) -> None:
 
 
 def _check_video(path: Path, name: str) -> None:
+    """Raise ValueError, which names the user's file `name`, if no frame of a video can be decoded."""
     video = cv2.VideoCapture(str(path))
     try:
         if not (video.isOpened() and video.read()[0]):

@@ -76,6 +76,7 @@ class LatestViewer:
         threading.Thread(target=self._follow, daemon=True).start()
 
     def _render(self, camera: Camera, place: Any) -> np.ndarray:
+        """Render the latest state, uint8 [H, W, 3]; gray before a state is loaded."""
         if self.gaussians is None:
             return np.full((camera.height, camera.width, 3), 230, np.uint8)
         return view.render_picture(self.gaussians, camera)
@@ -93,6 +94,7 @@ class LatestViewer:
             time.sleep(PERIOD)
 
     def _load(self, path: Path) -> Gaussians:
+        """Load the Gaussians of a file of `STATES`: a checkpoint, labels, or a .ply file."""
         if path.suffix == ".pt":
             state = torch.load(path, weights_only=True, map_location="cpu")
             return Gaussians(**state["optimizer"]["parameters"])

@@ -17,7 +17,7 @@ SOME_FAILED = 3  # exit code of `compare` if it finished and some runs failed; `
 
 
 def choose_engine(request: Request, arguments: argparse.Namespace) -> tuple[Request, Execution]:
-    """Return the request and the settings of the execution for the engine that the arguments name."""
+    """Return the request, with the engine's GPUs noted in `cuda`, and the execution by the engine of the arguments."""
     engine = make_engine(arguments.engine, arguments.address, request.root, request.runs)
     return replace(request, cuda=engine.cuda), Execution(engine, arguments.cores, memory_mb=expected_memory_mb)
 
@@ -40,11 +40,13 @@ def _batch(request: Request, arguments: argparse.Namespace) -> int:
 
 
 def _collect_garbage(request: Request, arguments: argparse.Namespace) -> int:
+    """Remove artifacts that no plan uses (`collect_garbage`); return 0."""
     collect_garbage(request, arguments.yes)
     return 0
 
 
 def _clean(request: Request, arguments: argparse.Namespace) -> int:
+    """Remove the results of a scene (`clean`); return 0."""
     clean(request)
     return 0
 

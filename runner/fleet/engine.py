@@ -131,7 +131,7 @@ class LocalEngine:
                 self._change.notify_all()
 
     def _fits(self, cores: int, gpus: int, memory_mb: int) -> bool:
-        """Return whether the resources are free. They always are if no stage runs."""
+        """Return whether the resources are free; True whenever no stage runs."""
         if not self._reserved:
             return True
         reserved = sum(self._reserved.values()) + memory_mb
@@ -154,7 +154,7 @@ def free_memory_mb() -> int:
 def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
     """Estimate the CPU memory in MB to reserve for a stage.
 
-    It is 10 % above the largest peak of this stage in the receipts of the scene and its variants, whatever their
+    The result is 10 % above the largest peak of this stage in the receipts of the scene and its variants, of any
     profile. Before the first run it follows from the size of all files in the folders of `needs`, by the table `memory`
     of pipeline.yaml; 0 if the stage is not in the table.
 

@@ -66,7 +66,7 @@ def run_all(
 ) -> None:
     """Do several runs, in parallel if cores allow. If one fails, the others go on.
 
-    By default each group gets an equal part of the engine's cores, at least one. With n GPUs at most n stages have one
+    By default each group gets an equal part of the engine's cores, at least one. With n GPUs at most n stages use a GPU
     at a time, and each of them gets at least the part 1 / (n + 1) of the cores. The number of cores of a stage does not
     change when other runs end, so that no result depends on the order in which runs end.
 

@@ -136,6 +136,7 @@ class Progress:
         return [line[: width - 1] for line in [head, *visible, *more]]
 
     def _describe(self, row: _Row) -> str:
+        """Return as text how long the current stage has run and what is left, or that the stage waits."""
         if row.state == WAITS:
             return "waits for cores or memory"
         seconds, since = self._seconds_left(row), format_seconds(time.monotonic() - row.since)
@@ -154,6 +155,7 @@ class Progress:
         return total
 
     def _redraw(self) -> None:
+        """Draw the table every `REDRAW_SECONDS` until the context ends; runs in a thread."""
         while not self._ended.wait(REDRAW_SECONDS):
             self._draw()
 

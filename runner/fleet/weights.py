@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def fetch_weights(request: "Request", offline: bool) -> int:
-    """List the weights that all stages need or could use, and download the missing ones, optional ones too.
+    """Print the weights that all stages need or could use, and download the missing ones, optional ones too.
 
     Args:
         request: the options. If they name a scene, its scene.yaml counts too.

@@ -29,7 +29,7 @@ def optional_weights(params: Params) -> list[local.Need]:
 def machine_facts(params: Params) -> dict[str, str]:
     """Return facts about this machine on which masks from clicks and refined masks depend.
 
-    They are "segmenter" -> hash of the network's files, or a name if there are none. The dict is empty without such
+    The dict has "segmenter" -> hash of the network's files, or a name if there are no files. It is empty without such
     masks.
     """
     return segmenter_facts(params.segmenter) if params.clicks or params.refine else {}

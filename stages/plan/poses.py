@@ -26,10 +26,10 @@ REDUCED = re.compile(r"images_\d+")  # folders of pictures at a fraction of thei
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Return the sorted files of the scene that the stage reads.
 
-    They are the photographs and depth maps of the capture, the Gaussians that the scene brings, and all files that are
-    neither pictures nor depth maps, except scene.yaml, the file of clicks and the folder of painted references. So the
-    stage does not run again when masks, clicks or references are added. If the scene cannot be read, all files but
-    scene.yaml and the clicks are returned.
+    They are the photographs and depth maps of the capture, the masks of ignored pixels, the Gaussians that the scene
+    brings, and all files that are neither pictures nor depth maps, except scene.yaml, the file of clicks and the folder
+    of painted references. So the stage does not run again when masks, clicks or references are added. If the scene
+    cannot be read, all files but scene.yaml and the clicks are returned.
 
     Args:
         scene: folder of the scene.
@@ -54,9 +54,10 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     """Return facts about the capture; {} without photographs.
 
-    They are "views": [training, test, clean, camera-only], a list of view names each; "brings_poses": whether
-    structure from motion is left out; and "megapixels": the size of the first view, as it will be used. The stage
-    depends on the roles of views, which may depend on the names of masks, while it does not read the masks.
+    The facts are "views": [training, test, clean, camera-only], a list of view names each; "brings_poses": whether
+    structure from motion is left out; "megapixels": the size of the first view, as it will be used; and, only if there
+    are masks of ignored pixels, "ignore": view name -> their files. The stage depends on the roles of views, which may
+    depend on the names of masks, while it does not read the masks.
 
     Args:
         scene: folder of the scene.
