@@ -36,6 +36,11 @@ def typed_command(name: str, scene: Path | None) -> str:
     return f"reffusion {name} --scene {scene}" if scene else f"reffusion {name}"
 
 
+def name_scene(scene: Path) -> str:
+    """Return the name of a scene that is given by its name under data/, or by the path of its folder or video."""
+    return scene_name(scene_path(str(scene), root()) or scene.expanduser().resolve())
+
+
 def run_folder(arguments: argparse.Namespace) -> Path:
     """Return the folder of a scene's stages: runs/<scene>, or runs/<scene>@<variant> if a variant is named.
 
@@ -43,5 +48,5 @@ def run_folder(arguments: argparse.Namespace) -> Path:
         arguments: the result of a parser of `scene_parser`. The scene may be a name under data/, the path of a folder,
             or the name or path of a video, whose name without its ending is then the scene's name.
     """
-    name = scene_name(scene_path(str(arguments.scene), root()) or arguments.scene.expanduser().resolve())
+    name = name_scene(arguments.scene)
     return arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name)

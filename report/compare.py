@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from report import charts, compare_pictures, compare_tables, page
+from report import charts, cli, compare_pictures, compare_tables, page
 from report.results import (
     BOX_SCORES,
     DIFFERENCE_COLUMNS,
@@ -337,7 +337,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     try:
-        name = arguments.scene.expanduser().resolve().name if arguments.scene else FOLDER_COMPARISON
+        name = cli.name_scene(arguments.scene) if arguments.scene else FOLDER_COMPARISON
         paths = make(home := arguments.runs / name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None

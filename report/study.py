@@ -26,7 +26,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
-from report import camera_path
+from report import camera_path, cli
 from report.results import FOLDER_COMPARISON, FULL, Comparison, Run, load_comparison
 from report.sheet import GAP, pick_evenly
 from report.turntable import RATE, save_video
@@ -199,7 +199,7 @@ def main() -> None:
     if not arguments.scene and not arguments.data:
         parser.error("--scene or --data: of which comparison?")
     methods = [method for method in arguments.variants.split(",") if method]
-    name = arguments.scene.name if arguments.scene else FOLDER_COMPARISON
+    name = cli.name_scene(arguments.scene) if arguments.scene else FOLDER_COMPARISON
     try:
         print(make(arguments.runs / name, methods, arguments.seed))
     except ValueError as error:

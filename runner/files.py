@@ -110,9 +110,11 @@ def hold_lock(runs: Path, name: str, shared: bool = False, wait: bool = True) ->
             say(f"{name} was last in use on {host}; is it still? Only one at a time may work in {display_path(runs)}")
         if not shared:
             _sign(file.fileno(), f"{os.getpid()} {MACHINE}\n")
-        yield file.fileno()
-        if not shared:
-            _sign(file.fileno(), "")
+        try:
+            yield file.fileno()
+        finally:
+            if not shared:
+                _sign(file.fileno(), "")
 
 
 def _lock(lock: int, name: str, mode: int, wait: bool) -> None:

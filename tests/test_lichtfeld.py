@@ -122,6 +122,14 @@ def press_fill(panel, program) -> str:
     return shown.shown[-1]
 
 
+def write_small_job(path: Path) -> Path:
+    """Write a program that calls `reffusion` with the words it is given, and with parameters of a small job."""
+    small = "poses.longest=96 initialize.refit_steps=20 distill.iterations=4"
+    path.write_text(f'#!/bin/sh\nexec "{COMMAND}" "$@" --profile laptop --set "{small}"\n')
+    path.chmod(0o755)
+    return path
+
+
 def write_program(path: Path) -> Path:
     """Write a program that stands in for `reffusion`: the filled scene is the one after the deletion."""
     lines = ["#!" + sys.executable, "import shutil, sys", "assert sys.argv[1] == 'patch'", "print('evaluate: done')"]
@@ -190,7 +198,7 @@ def test_what_the_command_refuses_is_shown(load_plugin):
 
 
 @pytest.mark.slow
-def test_the_command_fills_what_is_selected(load_plugin, monkeypatch):
+def test_the_command_fills_what_is_selected(load_plugin, tmp_path):
     means, deleted = sample_room("back")
     count = len(means)
     made, colors = random_gaussians(count, 0), torch.rand(count, 1, 3, generator=torch.Generator().manual_seed(0))
@@ -198,5 +206,5 @@ def test_the_command_fills_what_is_selected(load_plugin, monkeypatch):
     whole = type(made)(torch.from_numpy(means).float(), made.quaternions, scales, opacities, colors - 0.5)
     editor, panel, _ = load_plugin(whole)
     editor.selection_mask = torch.from_numpy(deleted)
-    last = press_fill(panel, COMMAND)
+    last = press_fill(panel, write_small_job(tmp_path / "program"))
     assert "in place of room" in last and editor.nodes["filled"].num_points > np.count_nonzero(~deleted)

@@ -161,9 +161,7 @@ def test_photographs_that_are_shifted_against_their_poses(tmp_path, shift):
     text = sorted(NAMES)
     given = {name: true_poses()[text[(k + shift) % VIEWS]] for k, name in enumerate(text)}
     folder = write(tmp_path / "s", given)
-    random = np.random.default_rng(
-        0
-    )  # points of the far wall, with wrong colors: they are compared
+    random = np.random.default_rng(0)  # points of the far wall, with wrong colors: they are compared
     points = np.concatenate([random.uniform(-0.5, 0.5, (500, 2)), np.ones((500, 1))], 1)
     save_points(folder / "sparse_pc.ply", points, random.integers(0, 256, (500, 3)).astype(np.uint8))
     verdict = judge_poses(load_capture(folder))

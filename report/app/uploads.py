@@ -49,6 +49,7 @@ class Upload:
         self.name = next(n for n in (clean, *(f"{clean}-{k}" for k in range(2, 1000))) if not taken(n))
         self.scene: Path | None = None  # the folder or video, once a file is there
         self.count = 0
+        self._names: dict[str, str] = {}  # name of a picture's file here -> name of the user's file
 
     async def receive(self, name: str, parts: AsyncIterator[bytes]) -> None:
         """Receive a picture or a video.
@@ -68,6 +69,8 @@ class Upload:
         is_video = ending in VIDEOS
         if self.count >= MAX_PICTURES or (self.scene is not None and is_video == self.scene.is_dir()):
             raise ValueError(f"{name}: drop either one video or up to {MAX_PICTURES} photographs")
+        if not is_video:
+            clean = self._free_name(clean, name)
         place = self.data / f"{self.name}{ending}" if is_video else self.data / self.name / "images" / clean
         partial = place.with_name(f"{TEMPORARY}{uuid4().hex}{ending}")
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -81,6 +84,14 @@ class Upload:
                 place.parent.rmdir()
                 place.parent.parent.rmdir()
         self.scene, self.count = place if is_video else self.data / self.name, self.count + 1
+
+    def _free_name(self, clean: str, name: str) -> str:
+        """Return a picture's name, numbered if another file of the user has it, as a_b.jpg of "a b.jpg"."""
+        path, number = Path(clean), 1
+        while self._names.setdefault(clean, name) != name:
+            number += 1
+            clean = f"{path.stem}-{number}{path.suffix}"
+        return clean
 
 
 async def _write(path: Path, parts: AsyncIterator[bytes], limit: int) -> None:
