@@ -82,7 +82,9 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     try:
         params = planned.Params(**question["params"])
     except ValidationError as error:
-        return {"errors": [_error(e, planned.Params, list(fields)) for e in error.errors()], "known": list(fields)}
+        # Of alternatives, such as a name or keys, the one that was not meant comes last.
+        errors = sorted(error.errors(), key=lambda e: e["type"] == "string_type" and isinstance(e["input"], dict))
+        return {"errors": [_error(e, planned.Params, list(fields)) for e in errors], "known": list(fields)}
     ask = lambda function, *arguments: getattr(planned, function, lambda *_: None)(*arguments)
     marked = lambda mark, value: [name for name, marks in fields.items() if (marks or {}).get(mark) is value]
     answer = {"params": params.model_dump(mode="json"), "weights": marked("weights", True)}
@@ -129,6 +131,10 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
             yield from _fields(info.annotation, f"{prefix}{name}.")
 
 
+# Type of an error of pydantic -> words that its own message lacks.
+PLAIN_WORDS = {"list_type": "write a list, such as [a, b]", "extra_forbidden": "there is no such key"}
+
+
 def _error(error: Any, model: type[BaseModel], known: list[str]) -> dict[str, Any]:
     """Convert an entry of pydantic's `ValidationError.errors()`; "unknown" means that no parameter has this name."""
     first, *names = error["loc"] or ("?",)
@@ -143,7 +149,7 @@ def _error(error: Any, model: type[BaseModel], known: list[str]) -> dict[str, An
     while unknown and isinstance(value, dict) and value:  # of an unknown group, its first parameter is named
         name, value = next(iter(value.items()))
         where += f".{name}"
-    message = error["msg"].removeprefix("Value error, ")
+    message = PLAIN_WORDS.get(error["type"]) or error["msg"].removeprefix("Value error, ")
     return {"where": where, "unknown": unknown, "value": reprlib.repr(value), "message": message}
 
 

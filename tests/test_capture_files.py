@@ -475,3 +475,13 @@ def test_a_16_bit_gray_photograph(tmp_path):
     Image.fromarray(levels).save(folder / "images/v02.png")
     _, out, _ = run_with_warnings(folder)
     assert np.array_equal(load_views(out, ["v02"])["v02"][..., 1], np.round(levels / 257).astype(np.uint8))
+
+
+def test_pictures_that_no_frame_lists_are_named_and_need_no_masks(tmp_path):
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
+    record = json.loads((folder / "transforms.json").read_text())
+    picture = Path(record["frames"].pop()["file_path"]).name
+    (folder / "transforms.json").write_text(json.dumps(record))
+    scene, _, messages = run_with_warnings(folder)
+    assert len(scene.cameras) == len(record["frames"])
+    assert f"1 pictures are not in transforms.json and are left out: {picture}" in messages

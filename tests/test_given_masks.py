@@ -182,6 +182,11 @@ def test_photographs_are_no_masks(tmp_path):
             assert refusal(tmp_path / f"{name}.{ending}") == f"{name}.{ending}: {REFUSED}"
 
 
+def test_a_cut_out_on_white_is_no_mask(tmp_path):
+    Image.fromarray(np.where(OBJECT[..., None], PHOTO, 255).astype(np.uint8)).save(tmp_path / "x.png")
+    assert refusal(tmp_path / "x.png").startswith("x.png: a photograph cut out on one color; save white")
+
+
 def test_a_cut_out_that_is_mostly_object_is_ambiguous(tmp_path):
     """It could also be a photograph in which the object was blackened."""
     Image.fromarray(np.where(OBJECT[..., None], 0, PHOTO).astype(np.uint8)).save(tmp_path / "x.png")

@@ -56,7 +56,31 @@ def move_pictures(folder: Path) -> None:
     )
 
 
+def renumber_masks(folder: Path) -> None:
+    for k in range(6):
+        (folder / "masks" / f"v{k:02d}.png").rename(folder / "masks" / f"{k + 1:05d}.png")
+
+
+def rename_masks(folder: Path) -> None:
+    (folder / "masks").rename(folder / "segmentation")
+
+
+def stack_masks(folder: Path) -> None:
+    drop_masks(folder)
+    np.save(folder / "masks.npy", np.zeros((6, HEIGHT, WIDTH), bool))
+
+
+def double_intrinsics(record: dict) -> None:
+    record.update(cx=float(WIDTH), cy=float(HEIGHT))
+    for key in ("w", "h"):
+        record.pop(key, None)
+
+
 REFUSALS = [
+    ("masks numbered from 1", renumber_masks, {}, r"00001\.png.*numbered from 1, pictures from 0; renumber all masks"),
+    ("masks of another name", rename_masks, {}, "segmentation holds 6 pictures named like.*`masks: segmentation`"),
+    ("a stack of masks", stack_masks, {}, r"masks\.npy is not read: save a mask for each picture"),
+    ("intrinsics of another size", edit_transforms(double_intrinsics), {}, "those of another size; add that size as w"),
     ("mask for no picture", lambda f: write_masks(f / "masks", ["zz"]), {}, r"zz\.png.*no picture"),
     ("no mask at all", drop_masks, {}, "no mask at all.*masks: none"),
     ("no file of the layout", lambda f: (f / "transforms.json").unlink(), {"layout": "transforms"}, "correct `layout`"),

@@ -88,6 +88,12 @@ def test_exposure_that_jumps(wall_capture):
     assert "exposed otherwise than the rest (a2; a2 is 0.4" in describe_oddities(scene, masks, pictures | {"a2": dark})
 
 
+def test_a_black_photograph_is_to_be_left_out(wall_capture):
+    scene, masks, pictures = wall_capture
+    warned = describe_oddities(scene, masks, pictures | {"a2": np.zeros_like(pictures["a2"])})
+    assert "black photographs: a2; leave them out by `exclude: [a2]`" in warned and "exposed otherwise" not in warned
+
+
 def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, wall_capture):
     _, masks, _ = wall_capture
     poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / "wall", 1.5)

@@ -5,15 +5,23 @@ Masks may distinguish between several objects: each object then has a folder of 
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, pair_masks, shorten_path, strip_ending
+from reffusion.capture.names import (
+    MASK_ENDINGS,
+    is_mask_of_another,
+    list_pictures,
+    pair_masks,
+    shorten_path,
+    strip_ending,
+)
 from reffusion.io.annotations import annotated_pictures, is_labelme
-from reffusion.io.files import BadInput
+from reffusion.io.files import VIDEOS, BadInput
 from reffusion.io.given_masks import WHITE, MaskValues
 from reffusion.io.images import ENDINGS
 from reffusion.params.capture import MaskSpec
@@ -92,10 +100,27 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
         return FoundMasks({})
     raise BadInput(
         f"{folder}: no mask at all (looked for {', '.join(shorten_path(p, folder) for p in places)}"
-        f"{''.join(map(_unread, places))}); click on "
+        f"{''.join(map(_unread, places))}){_guess_masks(folder, capture)}; click on "
         f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
         "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
     )
+
+
+def _guess_masks(folder: Path, capture: Capture) -> str:
+    """Return a hint, for a message, at what may be masks under another name in the scene's folder; perhaps empty."""
+    paths = {name: (name, *paths) for name, paths in capture.paths.items()}
+    ours = {parent for path in capture.pictures.values() for parent in path.parents}
+    for place in sorted(folder.iterdir()):
+        if place.name.startswith(".") or place in ours:
+            continue
+        if place.is_dir() and not place.name.startswith("images"):
+            count = len(pair_masks(list_pictures(place), paths))
+            if count > len(paths) / 2:
+                why = f"{place.name} holds {count} pictures named like the photographs"
+                return f"; {why}: if they are masks, say `masks: {place.name}`"
+        elif "mask" in place.name.lower() and place.suffix.lower() in (".npy", ".npz", *VIDEOS):
+            return f"; {place.name} is not read: save a mask for each picture in masks/, named like it"
+    return ""
 
 
 def find_ignore_masks(folder: Path, capture: Capture, name: str | None) -> dict[str, tuple[Path, ...]]:
@@ -236,8 +261,24 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
             raise BadInput(
                 f"{place / lone[0]}: {' and '.join(several)} are called so; put masks into folders as pictures are"
             )
-        raise BadInput(f"{place / lone[0]}: a mask for no picture; name it like its picture, or remove it")
+        hint = "; name it like its picture, or remove it"
+        if (shift := _numbering_shift(files, views)) is not None:
+            hint = (
+                f": masks are numbered from {shift[0]}, pictures from {shift[1]}; renumber all masks, and remove none"
+            )
+        raise BadInput(f"{place / lone[0]}: a mask for no picture{hint}")
     return found
+
+
+def _numbering_shift(masks: Collection[str], views: Collection[str]) -> tuple[int, int] | None:
+    """Return the first number of masks and of views if both are numbered alike, from different numbers; else None."""
+    numbers = [
+        sorted(int(found[0]) for name in names if (found := re.findall(r"\d+$", strip_ending(name))))
+        for names in (masks, views)
+    ]
+    steps = {view - mask for mask, view in zip(*numbers, strict=False)}
+    is_shifted = len(steps) == 1 and steps != {0} and len(masks) == len(views) == len(numbers[0]) == len(numbers[1])
+    return (numbers[0][0], numbers[1][0]) if is_shifted else None
 
 
 def _assign_masks(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:

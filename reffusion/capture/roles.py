@@ -166,7 +166,11 @@ def assign_roles(
     messages = [found.warning] if found.warning else []
     unmasked = [name for name in train_named if name not in kept and name not in clean_views]
     if kept and unmasked:
-        messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}")
+        is_end = (
+            len(unmasked) == 1 and unmasked[0] in (min(train_named), max(train_named)) and unmasked[0][-1:].isdigit()
+        )
+        hint = "; if masks are numbered from another number than pictures, all lie one picture off" if is_end else ""
+        messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}{hint}")
     if scored := [name for name in test_views if name in ignored]:
         messages.append(f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}")
     return Roles(

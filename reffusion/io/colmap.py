@@ -246,7 +246,7 @@ def _points_binary(path: Path) -> ModelPoints:
         starts[k] = at
         at += POINT.itemsize + 8 * int.from_bytes(file.data[at + track_at : at + POINT.itemsize], "little")
         if at > len(file.data):
-            raise BadInput(f"{path}: cut off at byte {len(file.data)}")
+            raise BadInput(f"{path}: cut off at byte {len(file.data)}; copy or export it again")
     file.at = at
     file.check_end()
     data = np.frombuffer(file.data, np.uint8)

@@ -126,7 +126,7 @@ class Cursor:
     def check_left(self, count: int, size: int) -> None:
         """Raise BadInput if fewer than `count` records of `size` bytes follow. Nothing is read."""
         if self.at + count * size > len(self.data):
-            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
+            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}; copy or export it again")
 
     def read_count(self, size: int) -> int:
         """Read and return a count (uint64). Raises BadInput if fewer than so many records of `size` bytes follow."""
@@ -138,7 +138,7 @@ class Cursor:
         """Return the UTF-8 text before the next zero byte, and advance beyond this byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
+            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}; copy or export it again")
         name, self.at = self.data[self.at : end].decode(), end + 1
         return name
 

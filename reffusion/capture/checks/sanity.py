@@ -21,6 +21,7 @@ LOOKED_AT = 24  # largest number of masks, spread evenly, with which each mask i
 RAYS, DEPTHS = 64, 128  # pixels of a mask, and points on the ray of each; many, since the object is short on a ray
 AGREE = 0.75  # share of the other masks that must contain a point, so that it may be on the object
 SUPPORTED = 0.3  # share of a mask's pixels with such a point; a mask with less shows something else
+BLACK = 0.1  # a photograph is black if its brightness is less than this share of that of the others
 BRIGHTER = 1.5  # a photograph is odd if it is this many times as bright as the others, or as dark
 POINTS = 5000  # largest number of points at which photographs are compared
 LEAST_SEEN = 50  # points that must be visible in a view to judge it
@@ -53,13 +54,18 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
             others = (total - own)[here] / (count[here] - 1)
             ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
     jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
+    dark = sorted(name for name, ratio in jumps.items() if ratio < BLACK)
+    remedy = f"leave them out by `exclude: [{', '.join(dark)}]` in scene.yaml"
+    black = [f"black photographs: {_join_names(dark)}; {remedy}"] if dark else []
+    jumps = {name: ratio for name, ratio in jumps.items() if name not in dark}
     if not jumps:
-        return []
+        return black
     worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
     who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
     return [
+        *black,
         f"{who} exposed otherwise than the rest ({_join_names(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
-        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
+        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)",
     ]
 
 

@@ -8,7 +8,7 @@ lengths.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,10 @@ def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) ->
     found = correction.apply(Poses(lenses, poses, *NO_POINTS, {}))
     points, messages = _points(folder, source, frames[0].values, placed, found, pictures)
     paths = relative_paths(root, pictures)
+    beside = [path for key in ("mask_path", "depth_file_path") for path in _named_files(folder, placed, key).values()]
+    rest = _unlisted_pictures(root, [*files.values(), *beside])
     warnings = (
+        count_message(f"pictures are not in {source.name} and are left out", rest),
         count_message(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)),
         count_message("beside the test views are left out", unread),
         count_message(f"of the {len(frames)} frames in {source.name} are listed again with the same pose", repeated),
@@ -135,7 +138,8 @@ def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) ->
     return Capture(
         "transforms",
         pictures,
-        {view: (*paths[view], each.file_path) for view, each in placed.items()} | {path: (path,) for path in missing},
+        {view: (*paths[view], each.file_path) for view, each in placed.items()}
+        | {path: (path,) for path in missing + rest},
         replace(found, points=points[0], colors=points[1]),
         source,
         next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
@@ -265,6 +269,13 @@ def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dic
         if pairs:
             return {k: folder / place / name for k, name in sorted(pairs.items())}
     return {}
+
+
+def _unlisted_pictures(root: Path, listed: Sequence[Path]) -> list[str]:
+    """Return the pictures, relative to `root`, that lie beside those of the frames and that no frame lists, sorted."""
+    folders = {path.parent for path in listed if root in path.parents}
+    found = {folder / name for folder in folders for name in list_pictures(folder)}
+    return sorted(path.relative_to(root).as_posix() for path in found - {*listed})
 
 
 def _existing_picture(folder: Path, listed: str) -> Path | None:

@@ -32,9 +32,17 @@ def load_frame_lens(values: dict[str, Any], picture: Path, source: Path) -> Lens
     """Return a frame's lens, resized to the frame's picture file (see `frame_lens` and `resize_lens`).
 
     Raises:
-        BadInput: the frame's keys are wrong, or the picture's aspect ratio is another than that of the keys w and h.
+        BadInput: the frame's keys are wrong; the picture's aspect ratio is another than that of the keys w and h; or w
+            and h are missing, and the principal point is far from the picture's middle.
     """
-    return resize_lens(frame_lens(values, picture, source, image_size(picture)), picture)
+    width, height = image_size(picture)
+    lens = frame_lens(values, picture, source, (width, height))
+    if not {"w", "h"} & values.keys() and not (0.25 < lens.cx / width < 0.75 and 0.25 < lens.cy / height < 0.75):
+        raise BadInput(
+            f"{source}: cx, cy = {lens.cx:g}, {lens.cy:g} for '{picture.name}' of {width}x{height} px: they are "
+            "those of another size; add that size as w and h"
+        )
+    return resize_lens(lens, picture)
 
 
 def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:

@@ -70,11 +70,16 @@ POSE_FILES = (
     PoseFile("*.nvm", "VisualSFM", EXPORT),
     PoseFile("*calibrated_camera_parameters*.txt", "Pix4D", "export bundle.out from it"),
     PoseFile(
-        "*.csv", "RealityCapture", "export its Internal/External camera parameters to the scene's folder", b"heading"
+        "*.csv",
+        "RealityCapture",
+        "export its Internal/External camera parameters to the scene's folder, with commas between columns",
+        b"heading",
     ),
     PoseFile("*.csv", "a table of omega, phi and kappa", "export a COLMAP model or Bundler's bundle.out", b"appa"),
     PoseFile("cams/*_cam.txt", "MVSNet", "convert them to transforms.json"),
-    PoseFile("pose/*.txt", "NSVF", "convert them to transforms.json"),
+    PoseFile("pose/*.txt", "NSVF, ScanNet", "convert them to transforms.json"),
+    PoseFile("groundtruth.txt", "TUM", "convert it to transforms.json"),
+    PoseFile("sensors/trajectories.txt", "Kapture", "convert it by kapture_export_colmap.py"),
     PoseFile("*.pose.txt", "7-Scenes", "convert them to transforms.json"),
     PoseFile("cameras*.npz", "NeuS", "convert it to transforms.json"),
     PoseFile("odm_report/shots.geojson", "OpenDroneMap", "copy the project's opensfm/reconstruction.json here"),
