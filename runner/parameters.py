@@ -85,7 +85,10 @@ class Layers:
         """
         near = lambda other: f"{other}.".startswith(f"{name}.") or f"{name}.".startswith(f"{other}.")
         sets_it = lambda layer: any(map(near, flatten_params(layer.get(stage, {}))))
-        return next((label for label, layer in reversed(self.layers) if sets_it(layer)), "pipeline.yaml")
+        found = next((label for label, layer in reversed(self.layers) if sets_it(layer)), None)
+        # a key that a group lacks is to be added where the group is set
+        above, _, _ = name.rpartition(".")
+        return found or (self.origin(stage, above) if above else "pipeline.yaml")
 
 
 def stack_layers(

@@ -485,3 +485,13 @@ def test_pictures_that_no_frame_lists_are_named_and_need_no_masks(tmp_path):
     scene, _, messages = run_with_warnings(folder)
     assert len(scene.cameras) == len(record["frames"])
     assert f"1 pictures are not in transforms.json and are left out: {picture}" in messages
+
+
+def test_views_with_masks_of_only_some_objects_are_named(tmp_path):
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
+    boxes = (folder / "masks").rename(folder / "box")
+    (folder / "masks").mkdir()
+    boxes.rename(folder / "masks/box")
+    write_masks(folder / "masks/ball", [path.stem for path in sorted((folder / "masks/box").iterdir())[1:]])
+    _, _, messages = run_with_warnings(folder)
+    assert "1 training views have masks of only some objects, which do not count: v00; add empty masks" in messages

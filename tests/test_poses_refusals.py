@@ -87,7 +87,12 @@ REFUSALS = [
     ("no mask, pictures elsewhere", move_pictures, {}, "no mask at all.*masks: none"),
     ("named masks missing", None, {"masks": "nowhere"}, "nowhere.*correct `masks`"),
     ("empty masks", lambda f: write_masks(f / "masks", [f"v{k:02d}" for k in range(6)], value=0), {}, "are empty"),
-    ("mask of other proportions", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH)), {}, r"v01\.png.*72x96"),
+    (
+        "mask of other proportions",
+        lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH)),
+        {},
+        r"v01\.png.*72x96.*by 90",
+    ),
     ("two training views", drop_views, {}, "2 training views.*at least 3"),
     ("all views are test views", None, {"test": "every 1"}, "0 training views.*at least 3"),
     ("unreadable picture", lambda f: (f / "images" / "v01.png").write_text("x"), {}, r"v01\.png.*readable image"),

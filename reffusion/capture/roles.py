@@ -171,6 +171,12 @@ def assign_roles(
         )
         hint = "; if masks are numbered from another number than pictures, all lie one picture off" if is_end else ""
         messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}{hint}")
+    partial = [name for name in kept if not all(name in files for files in of_objects.values())]
+    if len(of_objects) > 1 and partial:
+        messages.append(
+            f"{len(partial)} training views have masks of only some objects, which do not count: {', '.join(partial)}; "
+            "add empty masks where an object is out of sight"
+        )
     if scored := [name for name in test_views if name in ignored]:
         messages.append(f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}")
     return Roles(

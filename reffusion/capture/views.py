@@ -153,7 +153,12 @@ def check_proportions(
     """
     (width, height), (of_width, of_height) = size, of_size
     if not is_in_proportion(size, of_size, tolerance):
+        turned = is_in_proportion((height, width), of_size, tolerance)
         raise BadInput(
             f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
-            f"make the {what} over the whole picture, in its proportions"
+            + (
+                f"turn the {what} by 90 degrees, as the photograph's file is without its EXIF orientation"
+                if turned
+                else f"make the {what} over the whole picture, in its proportions"
+            )
         )
