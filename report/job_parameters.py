@@ -76,7 +76,7 @@ def parameters_section(job: JobFiles) -> list[str]:
 
 
 def _short(value: Any) -> str:
-    """Return a value as text of at most 60 characters."""
+    """Return a value as JSON, but a string as it is, cut to 60 characters."""
     text = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
     return text if len(text) <= 60 else f"{text[:57]}..."
 

@@ -35,7 +35,8 @@ def make(scene: str, out: Path | None) -> str:
         out: folder to write, which must not exist or be empty; None for <name of the scene>-views beside the scene.
 
     Raises:
-        ValueError: the scene holds no panoramas, `out` is not empty, or the panoramas cannot be placed.
+        ValueError: there is no such scene, it holds no panoramas, the video is unusable, `out` is not empty, or the
+            panoramas cannot be placed.
     """
     source = scene_path(scene, root())
     if source is None:

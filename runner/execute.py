@@ -89,7 +89,7 @@ def _run_stage(
 
 
 def _time_left(stage: str, seconds: dict[str, float | None]) -> str:
-    """Return text on the expected time of a stage and of all in `seconds`; "" if that of the stage is unknown."""
+    """Return "; about <time>, <total> to the end" for a stage and all in `seconds`; "" if the stage's is unknown."""
     if (own := seconds.get(stage)) is None:
         return ""
     return f"; about {format_seconds(own)}" + (f", {format_total_time(seconds)} to the end" if len(seconds) > 1 else "")

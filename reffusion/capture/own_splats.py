@@ -76,7 +76,7 @@ def load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
 
 
 def _describe_looks(rows: Rows) -> Cloud:
-    """Return the means, sizes, colors and opacities by which Gaussians are recognized."""
+    """Return the means, log-scales, colors and opacities by which Gaussians are recognized."""
     opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))
     return Cloud(rows.means, rows.log_scales, 0.5 + SH0 * rows.sh[:, 0], opacities)
 

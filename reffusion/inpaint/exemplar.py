@@ -216,7 +216,7 @@ def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView
 
 
 def _roughness(plane: Plane, around: Background) -> float:
-    """Return the median over views of the median relative distance of pixels from a plane; inf if none shows enough."""
+    """Return the median over some views of the median relative distance of pixels near a plane; inf if too few."""
     medians = []
     for view in around.views[:: max(1, len(around.views) // 6)]:
         off = np.abs(view.depth / plane.depth(view.camera) - 1)

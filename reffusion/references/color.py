@@ -66,7 +66,7 @@ def paste(
 
 
 def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return [N, 3], the low-passed colors in [0, 1] of about `SAMPLES` known pixels, evenly spaced."""
+    """Return [N, 3], low-passed colors in [0, 1] of every k-th known pixel, row by row; N < 2 `SAMPLES`."""
     rows, columns = np.nonzero(known)
     every = max(1, len(rows) // SAMPLES)
     soft = cv2.GaussianBlur(image, (0, 0), 1.5)

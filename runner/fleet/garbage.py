@@ -67,7 +67,7 @@ def collect_garbage(request: Request, yes: bool) -> None:
 
 
 def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
-    """Yield unused artifacts, see `collect_garbage`; raises Refused if nothing was computed for the requested scene."""
+    """Yield what `collect_garbage` lists, and print which scenes it keeps; raises Refused if the scene never ran."""
     homes = sorted(path for path in request.runs.glob("*") if is_home(path)) if request.runs.is_dir() else []
     name = Path(request.scene).name
     with suppress(Refused):  # the scene may have been removed

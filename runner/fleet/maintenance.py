@@ -96,7 +96,7 @@ def clean(request: Request) -> None:
 
 
 def _homes(request: Request) -> list[Path]:
-    """Return the folders in runs/ of a scene and its variants (none if it was not run), or of the requested variant."""
+    """Return a scene's and its variants' folders in runs/, or the variant's; raises Refused if either is unknown."""
     name, runs = scene_name(Path(request.scene).expanduser()), request.runs
     existing = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if is_home(path))
     scenes = list(dict.fromkeys(each.partition("@")[0] for each in existing))

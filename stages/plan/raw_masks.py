@@ -49,14 +49,14 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[str]:
-    """Read and check all masks, and describe what the stage will do, a sentence each.
+    """Read and check all masks; return their number in words and the scene's warnings, [] without photographs.
 
     Args:
         scene: folder of the scene.
         poses: not used.
 
     Raises:
-        ValueError: a mask is unreadable, or all masks are empty or all are full.
+        ValueError: the scene cannot be read, a mask is unreadable, or all masks of a kind are empty or all are full.
     """
     if is_gaussians_only(params, scene):
         return []

@@ -29,7 +29,7 @@ def find(folder: Path) -> Path | None:
 
 
 def _columns(path: Path) -> tuple[int, list[str]]:
-    """Return the line number, from 1, of the column names, and the names in lower case; (0, []) for other files."""
+    """Return the line, 1 or 2, of the column names, and these in lower case, yaw as heading; else (0, [])."""
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
         # a line with the number of cameras may stand before the names
         for number in (1, 2):
