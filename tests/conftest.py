@@ -9,13 +9,8 @@ import pytest
 # Use an empty cache: no test result may depend on the weights in the cache of the user who runs the tests.
 os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
-# The first test files. `test_app` compiles most kernels; the others compile none, so that no two processes compile the
-# same kernels at the same time.
-FIRST = "test_app", "test_batch", "test_runner", "test_runner_faults", "test_bad_input"
-
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: FIRST.index(item.path.stem) if item.path.stem in FIRST else len(FIRST))
     if os.environ.get("REFFUSION_SLOW") != "1":
         for item in items:
             if item.get_closest_marker("slow"):
