@@ -60,7 +60,6 @@ def measure_change_by_prompts(pictures) -> float:
     return float((whole - crop).square().mean().sqrt() / whole.square().mean().sqrt())
 
 
-@pytest.mark.slow
 def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):
     pixels, masks, right, wrong = pictures
     assert len(right) == SAMPLES and (masks.mean((1, 2, 3)) > 0.65).float().mean() > 0.25
