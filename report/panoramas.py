@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from reffusion.capture.cut_panoramas import cut_panoramas
+from reffusion.capture.cut_panoramas import check_empty, cut_panoramas
 from reffusion.capture.layouts.capture import find_image_folder, find_pictures
 from reffusion.capture.layouts.panoramas import IMAGE_FOLDERS
 from reffusion.capture.video_frames import extract_frames
@@ -42,6 +42,7 @@ def make(scene: str, out: Path | None) -> str:
     if source is None:
         raise ValueError(f"{scene}: no such folder or video")
     out = out or source.with_name(f"{source.stem}-views")
+    check_empty(out)  # before the frames of a video are extracted
     if source.is_file():
         frames = out.with_name(f"{out.name}-frames")
         extract_frames(source, frames, "")

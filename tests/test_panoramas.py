@@ -97,6 +97,15 @@ def test_cut_panoramas_are_a_capture_with_true_poses(textures, tmp_path):
         panoramas.make(str(tmp_path / "pano"), None)
 
 
+def test_a_full_folder_is_refused_before_a_video_is_read(tmp_path):
+    (tmp_path / "clip.mp4").write_bytes(b"no video")
+    (tmp_path / "views").mkdir()
+    (tmp_path / "views/x.txt").write_text("x")
+    with pytest.raises(ValueError, match="views: not empty"):
+        panoramas.make(str(tmp_path / "clip.mp4"), tmp_path / "views")
+    assert not (tmp_path / "views-frames").exists()
+
+
 def test_other_pictures_are_no_panoramas(tmp_path):
     save_image(tmp_path / "c/images/a.png", np.zeros((60, 100, 3), np.uint8))
     with pytest.raises(ValueError, match=r"a\.png: 100x60 px; an equirectangular panorama is twice as wide as high"):

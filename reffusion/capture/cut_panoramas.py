@@ -61,6 +61,12 @@ def cut_view(panorama: np.ndarray, camera: Camera) -> np.ndarray:
     return cv2.remap(wide, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
+def check_empty(out: Path) -> None:
+    """Raise BadInput if a folder holds anything; it may be missing."""
+    if out.exists() and any(out.iterdir()):
+        raise BadInput(f"{out}: not empty; name another folder (--out)")
+
+
 def cut_panoramas(panoramas: Mapping[str, Path], out: Path) -> str:
     """Cut panoramas into views, images/<heading>/<name>.png in `out`, and place the views: sparse/0, a COLMAP model.
 
@@ -76,8 +82,7 @@ def cut_panoramas(panoramas: Mapping[str, Path], out: Path) -> str:
     Raises:
         BadInput: a picture is not twice as wide as high; `out` is not empty; or fewer than 3 panoramas can be placed.
     """
-    if out.exists() and any(out.iterdir()):
-        raise BadInput(f"{out}: not empty; name another folder (--out)")
+    check_empty(out)
     cameras: dict[str, Camera] = {}
     names, files = list(panoramas), list(panoramas.values())
     for k in trace.progress(len(names), "panoramas"):
