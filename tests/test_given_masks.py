@@ -187,6 +187,12 @@ def test_a_cut_out_on_white_is_no_mask(tmp_path):
     assert refusal(tmp_path / "x.png").startswith("x.png: a photograph cut out on one color; save white")
 
 
+def test_a_drawing_in_color_may_have_soft_edges(tmp_path):
+    soft = cv2.GaussianBlur(on_black((255, 0, 0)), (0, 0), 1)
+    Image.fromarray(np.where(soft > 250, 255, soft)).save(tmp_path / "x.png")
+    assert share_wrong(tmp_path / "x.png") < 0.1
+
+
 def test_a_cut_out_that_is_mostly_object_is_ambiguous(tmp_path):
     """It could also be a photograph in which the object was blackened."""
     Image.fromarray(np.where(OBJECT[..., None], 0, PHOTO).astype(np.uint8)).save(tmp_path / "x.png")

@@ -7,7 +7,7 @@ object is absent. A camera-only view (`cameras_only` in scene.yaml) is a camera 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -164,19 +164,7 @@ def assign_roles(
     for name, path in (*of_views, *((name, path) for name, paths in ignored.items() for path in paths)):
         check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
     messages = [found.warning] if found.warning else []
-    unmasked = [name for name in train_named if name not in kept and name not in clean_views]
-    if kept and unmasked:
-        is_end = (
-            len(unmasked) == 1 and unmasked[0] in (min(train_named), max(train_named)) and unmasked[0][-1:].isdigit()
-        )
-        hint = "; if masks are numbered from another number than pictures, all lie one picture off" if is_end else ""
-        messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}{hint}")
-    partial = [name for name in kept if not all(name in files for files in of_objects.values())]
-    if len(of_objects) > 1 and partial:
-        messages.append(
-            f"{len(partial)} training views have masks of only some objects, which do not count: {', '.join(partial)}; "
-            "add empty masks where an object is out of sight"
-        )
+    messages += _warn_missing(train_named, kept, clean_views, of_objects)
     if scored := [name for name in test_views if name in ignored]:
         messages.append(f"{len(scored)} test views have ignored pixels, which their scores count: {', '.join(scored)}")
     return Roles(
@@ -190,6 +178,28 @@ def assign_roles(
         values=found.values,
         ignore=ignored,
     )
+
+
+def _warn_missing(
+    train: Sequence[str],
+    masked: Collection[str],
+    clean: Collection[str],
+    of_objects: Mapping[str, Mapping[str, Path]],
+) -> list[str]:
+    """Return warnings about training views without masks, and about those with masks of only some objects."""
+    messages = []
+    unmasked = [name for name in train if name not in masked and name not in clean]
+    if masked and unmasked:
+        is_end = len(unmasked) == 1 and unmasked[0] in (min(train), max(train)) and unmasked[0][-1:].isdigit()
+        hint = "; if masks are numbered from another number than pictures, all lie one picture off" if is_end else ""
+        messages.append(f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}{hint}")
+    partial = [name for name in masked if not all(name in files for files in of_objects.values())]
+    if len(of_objects) > 1 and partial:
+        messages.append(
+            f"{len(partial)} training views have masks of only some objects, which do not count: {', '.join(partial)}; "
+            "add empty masks where an object is out of sight"
+        )
+    return messages
 
 
 def describe_split(train: int, test: int) -> str:

@@ -157,7 +157,7 @@ def check_proportions(
         raise BadInput(
             f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
             + (
-                f"turn the {what} by 90 degrees, as the photograph's file is without its EXIF orientation"
+                f"turn the {what} by 90 degrees: photographs count as stored, without EXIF orientation"
                 if turned
                 else f"make the {what} over the whole picture, in its proportions"
             )

@@ -17,7 +17,6 @@ from reffusion.io.arrays import load_array
 from reffusion.io.files import BadInput, as_bad_input, check_pixels
 from reffusion.io.images import image_size, open_image, resize_nearest
 
-MAX_BESIDE = 0.02  # largest share of other colors in a drawing of flat colors: those of soft edges
 DARK, LIGHT = 8, 200  # brightness up to which an area counts as background, and from which as a light gray
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 SAMPLES = 500_000  # number of pixels from which the levels of a mask are estimated
@@ -176,8 +175,8 @@ def _mark_by_colors(path: Path, colors: np.ndarray, lossless: bool, palette: boo
             f"{path}: its values ({found}) are neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere, or "
             "name the object's numbers in scene.yaml: `masks: {id: ...}`"
         )
-    beside = ~np.isin(numbers, areas) & (some.max(1) > DARK)  # neither a flat color nor black
-    if is_map and not is_gray and beside.mean() > MAX_BESIDE:
+    is_black = some.max(1) <= DARK
+    if is_map and not is_gray and (~np.isin(numbers, areas) & ~is_black).sum() > is_black.sum():
         raise BadInput(f"{path}: a photograph cut out on one color; save white where the object is, black elsewhere")
     if is_map:
         return brightness > high / 2

@@ -23,7 +23,7 @@ from reffusion.capture.layouts.capture import (
     relative_paths,
     resize_lens,
 )
-from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
+from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures, shorten_path
 from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
 from reffusion.io.files import BadInput, is_file, reading
 
@@ -59,14 +59,10 @@ def find_workspace(folder: Path) -> Path | None:
 def other_models(folder: Path, model: Path) -> str | None:
     """Return a message to the user about the COLMAP models that are not used; None if `model` is the only one."""
     found = _count_images(folder)
-    others = [f"{_relative(folder, path)} ({count})" for path, count in found.items() if path != model]
+    others = [f"{shorten_path(path, folder)} ({count})" for path, count in found.items() if path != model]
     if not others or model not in found:
         return None
-    return f"{_relative(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
-
-
-def _relative(folder: Path, path: Path) -> str:
-    return path.relative_to(folder).as_posix()
+    return f"{shorten_path(model, folder)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
 
 
 def _count_images(folder: Path) -> dict[Path, int]:
