@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -39,38 +41,50 @@ def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, st
     return np.isin(nodes, reached)
 
 
-def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
+def alpha_expansion(
+    cost: np.ndarray,
+    pairs: np.ndarray,
+    pair_cost: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    start: np.ndarray,
+) -> np.ndarray:
     """Return int [N] in [0, K), a labeling of N nodes with a low total cost, by expansion moves (Boykov et al. 2001).
 
-    The total cost is that of `min_cut`, with K labels. An expansion move gives one label to the set of nodes for which
-    this lowers the total cost most. The moves of all labels are repeated until none lowers the cost by more than
-    1 / `UNIT`. The result is a local minimum.
+    The total cost is the sum of the costs of the nodes' labels and of the pairs' labels. An expansion move gives one
+    label to the set of nodes for which this lowers the total cost most. The moves of all labels are repeated until none
+    lowers the cost by more than 1 / `UNIT`. The result is a local minimum.
 
     Args:
-        cost: [K, N] >= 0, cost of each label at each node.
+        cost: [K, N], cost of each label at each node.
         pairs: [E, 2] int, indices of neighboring nodes, each pair once.
-        strength: [E] >= 0, cost of a pair whose nodes have different labels.
+        pair_cost: takes the labels of the first and of the second nodes of all pairs, int [E] each, and returns the
+            costs of the pairs, [E] >= 0. Equal labels cost 0. The cost must be a metric on labels for each pair:
+            symmetric, and obeying the triangle inequality.
         start: int [N], initial labels. This array is not modified.
     """
-    labels, changed = start.copy(), True
-    first, second = pairs.T
-    while changed:
-        changed = False
+    (first, second), nodes = pairs.T, np.arange(cost.shape[1])
+    labels, between = start, pair_cost(start[first], start[second])
+    lowest, is_changed = cost[labels, nodes].sum() + between.sum(), True
+    while is_changed:
+        is_changed = False
         for label in range(len(cost)):
-            apart = labels[first] != labels[second]
-            keep = cost[labels, np.arange(len(labels))]
-            # A node "moves" if it takes `label`. A pair with different labels costs `strength` unless both nodes move.
-            # So each node that moves saves half of this cost, and a pair of which only one node moves pays half.
-            gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))
-            stay = np.where(labels == label, HARD, keep)  # a node that has the label counts as moved
-            moves = min_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))
-            moved = np.where(moves, label, labels)
-            if _total(cost, pairs, strength, moved) < _total(cost, pairs, strength, labels) - 1 / UNIT:
-                labels, changed = moved, True
+            one = np.full(len(pairs), label)
+            first_moves, second_moves = pair_cost(one, labels[second]), pair_cost(labels[first], one)
+            # As in Kolmogorov and Zabih 2004, the cost of a pair is split into costs of its nodes and a cost of a cut
+            # between them. A node "moves" if it takes `label`.
+            cut = np.maximum(first_moves + second_moves - between, 0) / 2
+            move, keep = cost[label].copy(), cost[labels, nodes]
+            np.add.at(move, first, first_moves - between - cut)
+            np.add.at(move, second, cut - first_moves)
+            moved = np.where(min_cut(move, keep, pairs, cut), label, labels)
+            if (moved == labels).all():
+                continue
+            moved_between = pair_cost(moved[first], moved[second])
+            total = cost[moved, nodes].sum() + moved_between.sum()
+            if total < lowest - 1 / UNIT:
+                labels, between, lowest, is_changed = moved, moved_between, total, True
     return labels
 
 
-def _total(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, labels: np.ndarray) -> float:
-    """Return the total cost of a labeling."""
-    between = strength[labels[pairs[:, 0]] != labels[pairs[:, 1]]]
-    return float(cost[labels, np.arange(len(labels))].sum() + between.sum())
+def potts_cost(strength: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the pair cost of `alpha_expansion` by which pairs [E] with different labels cost `strength` [E]."""
+    return lambda first, second: np.where(first != second, strength, 0.0)

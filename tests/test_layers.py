@@ -8,7 +8,7 @@ from scenes.cameras import make_camera
 from reffusion.background.continuation import _enclosed_patches
 from reffusion.depth.background_depth import CompletionSettings, Hints, ViewDepth, continue_depth
 from reffusion.depth.layers import label_surfaces, segment_surfaces
-from reffusion.graph_cut import alpha_expansion
+from reffusion.graph_cut import alpha_expansion, potts_cost
 from reffusion.morphology import dilate_by_distance
 
 
@@ -147,7 +147,7 @@ def test_labels_of_the_least_cost_are_found():
             apart = labels[pairs[:, 0]] != labels[pairs[:, 1]]
             return cost[labels, np.arange(7)].sum() + strength[apart].sum()
 
-        found = alpha_expansion(cost, pairs, strength, cost.argmin(0))
+        found = alpha_expansion(cost, pairs, potts_cost(strength), cost.argmin(0))
         least = min(total(np.array(labels)) for labels in itertools.product(range(3), repeat=7))
         assert total(found) < least + 0.02  # the graph's capacities are rounded to thousandths
 

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from reffusion import geometry
 from reffusion.depth.completion import unit_range
-from reffusion.graph_cut import HARD, alpha_expansion
+from reffusion.graph_cut import HARD, alpha_expansion, potts_cost
 
 JUMP = 0.025  # relative disparity step between neighbors that separates two surfaces
 MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are no surfaces
@@ -85,7 +85,7 @@ def label_surfaces(
     pairs, strength = _weighted_edges(index, colors)
     initial = np.where(label >= 0, label, np.where(assumed_label >= 0, assumed_label, cost.argmin(0)))
     result = surfaces.copy()
-    result[domain] = alpha_expansion(cost, pairs, strength, initial) + 1
+    result[domain] = alpha_expansion(cost, pairs, potts_cost(strength), initial) + 1
     return _remove_islands(result, surfaces, missing)
 
 

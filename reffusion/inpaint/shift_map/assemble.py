@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion.inpaint.poisson import blend
-from reffusion.inpaint.shift_map.expansion import expand, feature_distance, features, neighbor_pairs
+from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features, neighbor_pairs
 from reffusion.inpaint.source_image import SourceImage
 
 RING = 6  # px, width of the ring
@@ -189,7 +189,7 @@ def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], 
     known = features(*grid, pixels.colors, pixels.detail, shape, stride)
     off = np.minimum(feature_distance(look, known), 2 * MAX_DIFFERENCE)
     cost += np.where(pixels.in_hole | (cost >= INVALID_COST), 0, off)
-    return expand(cost, look, neighbor_pairs(*grid, shape, stride))
+    return choose_candidates(cost, look, neighbor_pairs(*grid, shape, stride))
 
 
 def _blend(

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.graph_cut import min_cut
+from reffusion.graph_cut import alpha_expansion
 
 COLOR_WEIGHT = 0.7  # weight of color; the weight of detail (color minus local mean) is 1
 GRADIENT_WEIGHT = 2.0  # weight of the difference of detail to the next pixel
-ROUNDS = 2  # passes of expansion moves over all candidates
 COST_SCALE = 0.1  # factor on all costs, so that their sum fits the 32-bit integers of the cut
 
 
@@ -63,7 +62,7 @@ def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]
     return pairs[(pairs >= 0).all(1)]
 
 
-def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def choose_candidates(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Choose one of L candidates for each of N pixels, so that the total cost is low.
 
     The total cost is the sum of all pixels' own costs and of a seam cost for each pair of neighbors. The seam cost is
@@ -77,28 +76,11 @@ def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     Returns:
         [N] int, the index of the candidate of each pixel.
     """
-    (first, second), pixels, labels = pairs.T, np.arange(cost.shape[1]), cost.argmin(0)
-    at_both = lambda label: (look[label, first], look[label, second])
-    seam = lambda one, two: feature_distance(one[0], two[0]) + feature_distance(one[1], two[1])
-    look_first, look_second = at_both(labels[first]), at_both(labels[second])
-    seams = seam(look_first, look_second)
-    lowest = cost[labels, pixels].sum() + seams.sum()
-    for candidate in list(range(len(cost))) * ROUNDS:
-        look_candidate = at_both(candidate)
-        first_moves, second_moves = seam(look_candidate, look_second), seam(look_first, look_candidate)
-        keep, move = cost[labels, pixels].copy(), cost[candidate].copy()
-        # As in Kolmogorov and Zabih 2004, the cost of a pair is split into costs of its pixels and a cost of a cut
-        # between them.
-        cut = np.maximum(first_moves + second_moves - seams, 0) / 2
-        np.add.at(move, first, first_moves - seams - cut)
-        np.add.at(move, second, cut - first_moves)
-        shared = np.minimum(keep, move)
-        moves = min_cut(COST_SCALE * (move - shared), COST_SCALE * (keep - shared), pairs, COST_SCALE * cut)
-        proposal = np.where(moves, candidate, labels)
-        if (proposal == labels).all():
-            continue
-        look_both = at_both(proposal[first]), at_both(proposal[second])
-        total = cost[proposal, pixels].sum() + seam(*look_both).sum()
-        if total < lowest:
-            labels, lowest, (look_first, look_second), seams = proposal, total, look_both, seam(*look_both)
-    return labels
+
+    first, second = pairs.T
+
+    def seam_cost(at_first: np.ndarray, at_second: np.ndarray) -> np.ndarray:
+        at_pixel = lambda pixel: feature_distance(look[at_first, pixel], look[at_second, pixel])
+        return COST_SCALE * (at_pixel(first) + at_pixel(second))
+
+    return alpha_expansion(COST_SCALE * cost, pairs, seam_cost, cost.argmin(0))
