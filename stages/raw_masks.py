@@ -82,5 +82,6 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
             save_mask(out / "masks" / f"{name}.png", mask | given.get(name, mask))
         return
     size = [side * scale for side in region.size or [2 * region.radius] * 3]
+    regions.check_region(regions.Region(center, size, region.size is None), scene)
     facts = {"center": center.tolist(), "size": size, "round": region.size is None}
     save_json(out / "region.json", {**facts, "holds": params.has_masks})  # holds the object, or is to be filled

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import itertools
 import json
 import re
 import shutil
@@ -37,6 +40,8 @@ from scenes.capture_checks import (
 from scenes.room import render_room_corner, room_walk, speckle_texture
 
 from reffusion.capture.scene_folder import read_scene
+from reffusion.io.files import BadInput
+from reffusion.io.given_masks import load_given_mask
 from reffusion.io.images import save_image
 from reffusion.params.poses import Params
 from stages import raw_masks
@@ -122,27 +127,37 @@ def write_capture_without_masks(folder: Path) -> list[str]:
 
 
 OUTLINE = [[24, 18], [47, 18], [47, 35], [24, 35]]  # of `OBJECT`, through the centers of its outer pixels
+POLYGON = {"shape_type": "polygon", "points": OUTLINE}
 
 
-def labelme_record() -> dict:
-    shape = {"label": "box", "shape_type": "polygon", "points": OUTLINE}
-    return {"imageWidth": WIDTH, "imageHeight": HEIGHT, "shapes": [shape]}
+def box_shape(mask: np.ndarray, corner: tuple[int, int]) -> dict:
+    """Return labelme's shape for a mask, bool [H, W], of the box that begins at the pixel `corner`."""
+    file, (x, y), (height, width) = io.BytesIO(), corner, mask.shape
+    Image.fromarray(mask).save(file, "png")
+    points = [[float(x), float(y)], [x + width - 1.0, y + height - 1.0]]
+    return {"shape_type": "mask", "points": points, "mask": base64.b64encode(file.getvalue()).decode()}
 
 
-def coco_record(names: list[str]) -> dict:
+def labelme_record(shape: dict) -> dict:
+    return {"imageWidth": WIDTH, "imageHeight": HEIGHT, "shapes": [{"label": "box", **shape}]}
+
+
+def coco_record(names: list[str], outline: object = None) -> dict:
     size = {"width": WIDTH, "height": HEIGHT}
-    outline = [[number for point in OUTLINE for number in point]]
+    outline = outline or [[number for point in OUTLINE for number in point]]
     pictures = [{"id": k, "file_name": f"{name}.png", **size} for k, name in enumerate(names)]
     annotations = [{"image_id": k, "category_id": 1, "segmentation": outline} for k in range(len(names))]
     return {"images": pictures, "annotations": annotations, "categories": [{"id": 1, "name": "box"}]}
 
 
-@pytest.mark.parametrize("place", ["masks", "images"])
-def test_outlines_of_labelme_in_a_folder_or_beside_pictures(tmp_path, place):
+@pytest.mark.parametrize(
+    ("place", "shape"), [("masks", POLYGON), ("images", POLYGON), ("images", box_shape(OBJECT[18:36, 24:48], (24, 18)))]
+)
+def test_outlines_of_labelme_in_a_folder_or_beside_pictures(tmp_path, place, shape):
     names = write_capture_without_masks(tmp_path / "s")
     for name in names:
         (tmp_path / "s" / place).mkdir(exist_ok=True)
-        (tmp_path / "s" / place / f"{name}.json").write_text(json.dumps(labelme_record()))
+        (tmp_path / "s" / place / f"{name}.json").write_text(json.dumps(labelme_record(shape)))
     roles = read_scene(Params(), tmp_path / "s")[1]
     assert {name: path.name for name, path in roles.masks[""].items()} == {name: f"{name}.json" for name in names}
     _, out, _ = run_with_messages(tmp_path / "s")
@@ -158,6 +173,118 @@ def test_outlines_of_coco(tmp_path, spec):
     assert_masked_views(out, names)
     read = raw_masks_plan.scene_files(raw_masks.Params(masks=spec), tmp_path / "s", [])
     assert read == [file]
+
+
+BLOBS = cv2.resize(np.random.default_rng(3).random((9, 12)), (WIDTH, HEIGHT)) < 0.5
+
+
+def test_labelme_box_lies_at_its_pixels(tmp_path):
+    (tmp_path / "x.json").write_text(json.dumps(labelme_record(box_shape(BLOBS[5:40, 7:60], (7, 5)))))
+    truth = np.zeros_like(BLOBS)
+    truth[5:40, 7:60] = BLOBS[5:40, 7:60]
+    assert np.array_equal(load_given_mask(tmp_path / "x.json"), truth)
+
+
+def test_labelme_box_of_another_size_is_refused(tmp_path):
+    shape = box_shape(BLOBS[5:40, 7:60], (7, 5)) | {"points": [[7, 5], [60, 39]]}
+    (tmp_path / "x.json").write_text(json.dumps(labelme_record(shape)))
+    with pytest.raises(BadInput, match=r"x\.json: a mask of 53 x 35 pixels in a box of 54 x 35; draw it anew$"):
+        load_given_mask(tmp_path / "x.json")
+
+
+# the runs of `OBJECT`, by pycocotools.mask.encode
+RUNS_TEXT = "bf1b0f1000000000000000000000000000000000000000000000^[3"
+
+
+def compress_runs(runs: list[int]) -> str:
+    """Return lengths of runs as pycocotools writes them: base 32, signed, from the fourth on as differences."""
+    text = ""
+    for k, run in enumerate(runs):
+        rest, ends = run - (runs[k - 2] if k > 2 else 0), False
+        while not ends:
+            rest, digit = divmod(rest, 32)
+            ends = rest == (-1 if digit >= 16 else 0)
+            text += chr(48 + digit + (0 if ends else 32))
+    return text
+
+
+def load_runs(folder: Path, text: str) -> np.ndarray:
+    """Return the mask of a COCO file whose compressed runs are `text`."""
+    record = coco_record(["v"], {"size": [HEIGHT, WIDTH], "counts": text})
+    (folder / "c.json").write_text(json.dumps(record))
+    return load_given_mask(folder / "c.json/v.png")
+
+
+@pytest.mark.parametrize("mask", [BLOBS, ~BLOBS, OBJECT, np.ones_like(OBJECT)])
+def test_compressed_runs_of_coco(tmp_path, mask):
+    runs = [len(list(group)) for _, group in itertools.groupby(mask.T.ravel())]
+    assert np.array_equal(load_runs(tmp_path, compress_runs([0, *runs] if mask[0, 0] else runs)), mask)
+
+
+def test_compressed_runs_as_pycocotools_writes_them(tmp_path):
+    assert np.array_equal(load_runs(tmp_path, RUNS_TEXT), OBJECT)
+
+
+@pytest.mark.parametrize("text", ["abc", "0 1", "0é", "5N", f"{RUNS_TEXT}o"])
+def test_damaged_compressed_runs_are_refused(tmp_path, text):
+    with pytest.raises(BadInput, match=r"c\.json/v\.png: its compressed runs are damaged; export it anew$"):
+        load_runs(tmp_path, text)
+
+
+def test_compressed_runs_that_are_cut_off_are_refused(tmp_path):
+    with pytest.raises(BadInput, match=rf"v\.png: its runs cover \d+ pixels of {WIDTH * HEIGHT}; export it anew$"):
+        load_runs(tmp_path, RUNS_TEXT[:12])
+
+
+@pytest.mark.parametrize("extra", [True, False])
+@pytest.mark.parametrize("style", ["{}", "{}_png.rf.0a1b"])
+def test_pictures_with_names_of_roboflow(tmp_path, extra, style):
+    """The photographs have their original names, or those of the export. Newer exports keep the original ones."""
+    names = [f"IMG_{k}" for k in range(4)]
+    write_pictures(tmp_path / "images", [style.format(name) for name in names])
+    record = coco_record([f"{name}_png.rf.0a1b" for name in names])
+    for name, picture in zip(names, record["images"], strict=True):
+        picture |= {"extra": {"name": f"{name}.png"}} if extra else {}
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/_annotations.coco.json").write_text(json.dumps(record))
+    found = read_scene(Params(), tmp_path)[1].masks[""]
+    assert {view: path.stem for view, path in found.items()} == {
+        style.format(name): f"{name}_png.rf.0a1b" for name in names
+    }
+
+
+def test_two_versions_of_a_picture_by_roboflow_are_refused(tmp_path):
+    write_pictures(tmp_path / "images", ["a", "b", "c"])
+    (tmp_path / "masks").mkdir()
+    record = coco_record(["a_png.rf.01", "a_png.rf.02", "b_png.rf.03"])
+    (tmp_path / "masks/_annotations.coco.json").write_text(json.dumps(record))
+    assert re.search(r"a_png\.rf\.02\.png: 'a' has another mask, .*a_png\.rf\.01\.png; ", refusal_message(tmp_path))
+
+
+def test_several_masks_for_each_picture_are_refused(tmp_path):
+    """Segment Anything's automatic generator writes them."""
+    for name in write_capture_without_masks(tmp_path):
+        write_masks(tmp_path / "masks" / name, ["0", "1", "2"])
+        (tmp_path / "masks" / name / "metadata.csv").write_text("id,area\n0,1\n")
+    place = tmp_path / "masks/v00"
+    assert refusal_message(tmp_path) == (
+        f"{place}: a folder of several masks for one picture; copy the object's to {place}.png, and move the folder "
+        "elsewhere"
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "spec"), [(".", None), ("masks", None), ("masks", "masks"), (".", "annotations.xml")]
+)
+def test_annotations_of_cvat_are_not_read(tmp_path, place, spec):
+    write_capture_without_masks(tmp_path)
+    file = tmp_path / place / "annotations.xml"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("<annotations/>")
+    assert refusal_message(tmp_path, masks=spec) == (
+        f'{file}: CVAT\'s annotations.xml is not read; export "Segmentation mask 1.1" and copy SegmentationClass/*.png '
+        "to masks, or export COCO"
+    )
 
 
 def test_arrays_of_one_mask(tmp_path):

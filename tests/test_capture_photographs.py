@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from scenes.capture_checks import run_with_messages
 from scenes.room import render_room_corner, room_textures, room_walk
 
 from lab.studies.bare_photographs import pose_errors
+from reffusion.capture.load import load_capture
+from reffusion.io.files import BadInput
 
 pytestmark = pytest.mark.integration
 
@@ -50,6 +53,18 @@ def test_webp_saved_by_a_browser_as_jpg(tmp_path):
     truth = save_walk(tmp_path / "s", ".jpg", format="WEBP", lossless=True)
     scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_placed(scene, truth)
+
+
+def test_copies_are_named_and_placeholders_of_icloud_are_refused(tmp_path):
+    save_walk(tmp_path / "images", ".png")
+    assert not load_capture(tmp_path).warnings
+    first = min((tmp_path / "images").iterdir())
+    shutil.copy(first, tmp_path / "images/copy.png")
+    (warning,) = load_capture(tmp_path).warnings
+    assert warning.startswith("1 photographs are copies, such as") and "copy.png" in warning
+    (tmp_path / "images/.IMG_1.HEIC.icloud").touch()
+    with pytest.raises(BadInput, match=r"images: 1 files are placeholders of iCloud, such as .IMG_1.HEIC.icloud"):
+        load_capture(tmp_path)
 
 
 def save_two_orientations(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:

@@ -60,7 +60,7 @@ def write_realitycapture(folder: Path, truth: Truth) -> None:
         axes = pose[:3, :3].T @ FLIP[:3, :3]  # columns: the camera's right, up and backwards
         heading, pitch = np.arctan2(axes[0, 1], axes[1, 1]), np.arcsin(axes[2, 1])
         angles = np.degrees([heading, pitch, np.arctan2(-axes[2, 0], axes[2, 2])])
-        focal, px = truth.lens.fx / WIDTH * 36, (truth.lens.cx - WIDTH / 2) / WIDTH
+        focal, px = truth.lens.fx / WIDTH * 36, (truth.lens.cx - WIDTH / 2) / WIDTH * 36
         numbers = (x, y, alt, *angles, focal, px, 0.0, *truth.lens.radial, 0, 0, 0, 0, 0)
         rows.append(",".join([f"{name}.png", *(repr(float(n)) for n in numbers)]))
     (folder / "cameras.csv").write_text("\r\n".join(rows) + "\r\n")
@@ -152,7 +152,7 @@ def test_cameras_of_other_programs(tmp_path, layout, write, model, points):
     ],
 )
 def test_heading_pitch_and_roll_of_realitycapture(tmp_path, angles, forward, up):
-    rows = [f"v{k}.png,{k},2,3,{angles},36,0.1,-0.05" for k in range(3)]
+    rows = [f"v{k}.png,{k},2,3,{angles},36,3.6,-1.8" for k in range(3)]
     (tmp_path / "a.csv").write_text("\n".join(["#name,x,y,alt,heading,pitch,roll,f,px,py", *rows]))
     write_pictures(tmp_path / "images", ["v0", "v1", "v2"])
     poses = load_capture(tmp_path).poses

@@ -287,7 +287,7 @@ def test_categories_of_coco_are_chosen_by_number(tmp_path):
 @pytest.mark.parametrize(
     ("segmentation", "message"),
     [
-        ({"size": [HEIGHT, WIDTH], "counts": "abc"}, "compressed runs are not read; export polygons"),
+        ({"size": [HEIGHT, WIDTH], "counts": "abc"}, "its compressed runs are damaged; export it anew"),
         ({"size": [HEIGHT, WIDTH], "counts": [5, 7]}, "its runs cover 12 pixels of 6912; export it anew"),
         ([], "boxes without outlines are not read; export polygons"),
     ],

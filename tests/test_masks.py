@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.cameras import make_scene
 from scenes.gaussians import join_gaussians, round_gaussians
 from scenes.stage_runs import run_masks
 
 from reffusion import geometry, morphology
 from reffusion.io.arrays import load_json, load_labels, save_json
+from reffusion.io.files import BadInput
 from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
+from reffusion.types import Similarity
 from stages.masks import Params
 
 # Depths of the square. At NEAR, close to the wall, the square hides a part of the wall from all views. At FAR, other
@@ -238,6 +241,14 @@ def test_a_box_behind_the_surface_has_no_silhouette():
     assert visible[36, 48] and not visible[2, 2]
     assert not regions.silhouette(box, view, np.full(wall.shape, 1 / 1.2)).any()
     assert not regions.silhouette(regions.Region([0, 0, -1.5], [0.2] * 3), view, wall).any()
+
+
+def test_a_region_that_no_view_shows_is_refused_with_places_in_the_scenes_frame():
+    view = wall_scene.front_camera("v", 0.0)
+    scene = make_scene({"v": view}, similarity=Similarity(0.01, np.array([100.0, 0, 0])))
+    regions.check_region(regions.Region([0, 0, 1.5], [0.2] * 3), scene)
+    with pytest.raises(BadInput, match=r"no view shows it; .* is \[5.1e\+03, 0, 150\], .* around \[100, 0, 0\]"):
+        regions.check_region(regions.Region([50, 0, 1.5], [0.2] * 3), scene)
 
 
 def test_masks_of_a_sphere_cover_what_lies_beyond_it():

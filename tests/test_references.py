@@ -41,8 +41,9 @@ from reffusion.capture.lenses import save_lenses
 from reffusion.depth import alignment
 from reffusion.io.arrays import save_json
 from reffusion.io.depth_maps import load_depth
+from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
-from reffusion.io.scene import load_references, load_scene
+from reffusion.io.scene import load_mask_sets, load_references, load_scene
 from reffusion.references import agreement, color, registration, view_ranking
 from reffusion.references.files import ReferenceFile
 from reffusion.references.undistort import undistort_reference, undistort_reference_depth
@@ -135,6 +136,16 @@ def test_of_a_picture_like_its_photograph_the_hole_alone_is_taken(wall_folders, 
     made = run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2"))["a2"]
     assert (made.image[:20, :20] == photo[:20, :20]).all()
     assert (made.image == picture)[made.mask].all()
+
+
+@pytest.mark.parametrize("shown", ["object", "gray"])
+def test_a_reference_that_nobody_painted_is_refused(wall_folders, tmp_path, shown):
+    photo, entry = load_image(wall_folders["poses"] / "images/a2.png"), reference_entry("a2")
+    sets = load_mask_sets(wall_folders["masks"], ["a2"])["a2"]
+    hole = (sets.consistent | sets.invent)[..., None]
+    save_image(wall_folders["scene"] / "ref.png", np.where(hole, np.uint8(128), photo) if shown == "gray" else photo)
+    with pytest.raises(BadInput, match=rf"ref.png: shows the {shown}.*; paint what is behind.* `trust: true`"):
+        run_reference_stage(wall_folders, tmp_path / "out", **entry)
 
 
 def test_where_no_photograph_has_a_hole_a_reference_is_asked_for(wall_folders, tmp_path):

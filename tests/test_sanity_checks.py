@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from scenes import wall_scene
 from scenes.cameras import make_scene
+from scenes.capture import make_truth, write_capture
 from scenes.wall_scene import front_camera
 
 from reffusion import geometry
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
 from reffusion.capture.image_detail import sample_visible
+from reffusion.capture.load import load_capture
 from reffusion.geometry import pixel_rays
-from reffusion.io.arrays import save_json
+from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import image_size, save_mask
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.types import Camera
@@ -54,6 +56,13 @@ def test_masks_that_disagree_in_3d(wall_capture):
     assert describe_oddities(scene, masks | {"a3": elsewhere}, pictures) == (
         "the mask of a3 shows something else than those of the other views do"
     )
+    empty = np.zeros_like(masks["a3"])
+    assert describe_oddities(scene, masks | {"a3": empty}, pictures) == (
+        "the mask of a3 is empty, though the object of the other masks lies in its view; is it hidden there?"
+    )
+    away = replace(scene.cameras["a3"], cx=1e4)
+    elsewhere_scene = replace(scene, cameras=scene.cameras | {"a3": away})
+    assert "is empty" not in describe_oddities(elsewhere_scene, masks | {"a3": empty}, pictures)
     far = {name: np.roll(mask, 17 * k, 0) for k, (name, mask) in enumerate(masks.items())}
     assert "masks do not agree in 3D" in describe_oddities(scene, far, pictures)
     assert describe_oddities(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
@@ -138,3 +147,14 @@ def test_points_outside_a_picture_hide_nothing():
     near_but_outside = corner * 0.5 - [1.0, 0.0, 0.0]
     values = sample_visible(camera, np.stack([corner, near_but_outside]), picture)[:, 0]
     assert values[0] == 0 and np.isnan(values[1])
+
+
+def test_cameras_with_positions_in_another_unit_are_named(tmp_path):
+    write_capture(tmp_path, "transforms", make_truth())
+    assert not load_capture(tmp_path).warnings
+    cameras = load_json(tmp_path / "transforms.json")
+    for row in cameras["frames"][0]["transform_matrix"][:3]:
+        row[3] *= 1000
+    save_json(tmp_path / "transforms.json", cameras)
+    (warning,) = load_capture(tmp_path).warnings
+    assert warning.startswith("1 of ") and "times as far away as usual" in warning

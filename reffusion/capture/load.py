@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from reffusion.capture.layouts import (
     bundler,
     colmap,
@@ -23,6 +25,7 @@ from reffusion.capture.layouts import (
     unread,
 )
 from reffusion.capture.layouts.capture import AS_GIVEN, Capture, Correction
+from reffusion.capture.layouts.intrinsics import check_intrinsics
 from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, as_bad_input, is_file
 from reffusion.io.images import image_size
@@ -36,6 +39,7 @@ PROGRAMS = {
     "3dgs": (splat_cameras.find, splat_cameras.read),
 }
 LAYOUTS = ("llff", "colmap", "transforms", *PROGRAMS, "photos")
+FAR = 50  # times the median distance of cameras from their middle: a camera that is farther away has another unit
 LONGEST = 1600  # px, longer side of the pictures in the paper
 
 
@@ -59,7 +63,8 @@ def load_capture(
 
     Raises:
         BadInput: the folder is no capture, two pictures share a view name, a picture is unreadable, a pose is not
-            finite or not a rotation, or the files contradict each other. The message names the file and the remedy.
+            finite or not a rotation, a lens is impossible (`check_intrinsics`), or the files contradict each other. The
+            message names the file and the remedy.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -71,7 +76,9 @@ def load_capture(
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with as_bad_input(_source(folder, layout), "a capture that can be read"):
         capture = _read(folder, layout, images, longest, references, correction)
-        return unread.add_warnings(folder, _restrict_to_poses(capture, correction))
+        if capture.poses is not None and capture.pose_source is not None:
+            check_intrinsics(capture.poses.lenses, capture.pose_source)
+        return unread.add_warnings(folder, _warn_of_far_cameras(_restrict_to_poses(capture, correction)))
 
 
 def _read(
@@ -103,6 +110,21 @@ def _restrict_to_poses(capture: Capture, correction: Correction) -> Capture:
     pictures = {name: path for name, path in capture.pictures.items() if name in lenses}
     turned = any(_fits_turned_only(path, lenses[name]) for name, path in pictures.items())
     return replace(capture, pictures=pictures, upright=turned or correction.upright)
+
+
+def _warn_of_far_cameras(capture: Capture) -> Capture:
+    """Return the capture with a warning if a few cameras are much farther from the cameras' middle than the others."""
+    if capture.poses is None or not capture.poses.world_to_camera:
+        return capture
+    poses = capture.poses.world_to_camera
+    centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses.values()])
+    distances = np.linalg.norm(centers - np.median(centers, 0), axis=1)
+    ratios = distances / max(np.median(distances), 1e-12)
+    far = [name for name, ratio in zip(poses, ratios, strict=True) if ratio > FAR]
+    if not far:
+        return capture
+    line = f"{len(far)} of {len(poses)} cameras are {ratios.max():.0f} times as far away as usual, such as {far[0]}"
+    return replace(capture, warnings=(*capture.warnings, f"{line}: are their positions in another unit?"))
 
 
 def _fits_turned_only(picture: Path, lens: Lens) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -20,7 +20,7 @@ from reffusion.capture.names import (
     shorten_path,
     strip_ending,
 )
-from reffusion.io.annotations import annotated_pictures, is_labelme
+from reffusion.io.annotations import annotated_pictures, is_labelme, original_names
 from reffusion.io.files import VIDEOS, BadInput
 from reffusion.io.given_masks import WHITE, MaskValues
 from reffusion.io.images import ENDINGS
@@ -29,6 +29,7 @@ from reffusion.params.capture import MaskSpec
 NONE = "none"
 IGNORE, ALL_VIEWS = "ignore", "all"  # usual folder of masks of what is ignored, and the name of a mask for every view
 COMPANIONS = (".txt", ".xml", ".xmp", ".csv", ".yaml", ".thm", "")  # endings of files beside a picture that are none
+CVAT = "annotations.xml"  # CVAT's own file, which is not read
 USUAL = (
     "masks",
     "mask",
@@ -78,6 +79,7 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
     if named.folder is not None:
         place, files = _mask_paths(folder / named.folder, capture)
         if not files:
+            _refuse_cvat([place])
             inside = any(place in path.parents for path in capture.pictures.values())
             why = (
                 "it holds photographs, and no mask beside one (A_mask.png beside A.png)"
@@ -98,12 +100,23 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
         return FoundMasks({"": capture.ignore_masks}, MaskValues(named.numbers, inverted=True), warning)
     if optional:
         return FoundMasks({})
+    _refuse_cvat([folder, *places])
     raise BadInput(
         f"{folder}: no mask at all (looked for {', '.join(shorten_path(p, folder) for p in places)}"
         f"{''.join(map(_unread, places))}){_guess_masks(folder, capture)}; click on "
         f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
         "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
     )
+
+
+def _refuse_cvat(places: Iterable[Path]) -> None:
+    """Raise BadInput if one of these places is, or holds, CVAT's own file."""
+    for path in (each for place in places for each in (place, place / CVAT)):
+        if path.name == CVAT and path.is_file():
+            raise BadInput(
+                f'{path}: CVAT\'s {CVAT} is not read; export "Segmentation mask 1.1" and copy SegmentationClass/*.png '
+                "to masks, or export COCO"
+            )
 
 
 def _guess_masks(folder: Path, capture: Capture) -> str:
@@ -252,6 +265,9 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
     found = pair_masks(files, everything)
     views = {name: paths for name, paths in everything.items() if name in capture.pictures}
     found |= pair_masks([path for path in files if path not in found], views)
+    originals = original_names(place, [path for path in files if path not in found])
+    pairs = pair_masks(originals.values(), everything)
+    found |= {path: pairs[name] for path, name in originals.items() if name in pairs}
     if strict and (lone := sorted(set(files) - found.keys())):
         if view := pair_masks(lone[:1], everything).get(lone[0]):
             twin = next(path for path in files if path != lone[0] and pair_masks([path], everything).get(path) == view)
@@ -260,6 +276,12 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
         if several := sorted(v for v in views if name in {PurePosixPath(strip_ending(p)).name for p in views[v]}):
             raise BadInput(
                 f"{place / lone[0]}: {' and '.join(several)} are called so; put masks into folders as pictures are"
+            )
+        holder = (place / lone[0]).parent
+        if pair_masks([f"{holder.name}.png"], everything):
+            raise BadInput(
+                f"{holder}: a folder of several masks for one picture; copy the object's to {holder}.png, and move the "
+                "folder elsewhere"
             )
         hint = "; name it like its picture, or remove it"
         if (shift := _numbering_shift(files, views)) is not None:

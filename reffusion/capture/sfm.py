@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 LEAST_VIEWS = 3  # smallest number of views for which poses must be found
+# Times that photographs without a focal length are mapped, from other random seeds: from a wrong start the mapping can
+# end in cameras that explain the matches in part only.
+MAPPINGS = 3
 LEAST_SIGHTINGS = 100  # a view with fewer observations is not adjusted
 SAME_FOCAL = 1.01  # ratio of EXIF focal lengths up to which photographs count as taken at one zoom
 EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: camera settings (a part of the tags), maker, model
@@ -85,7 +88,8 @@ def reconstruct(
         photographs: view name -> file; sizes may differ.
         longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
         work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
-        seed: random seed of COLMAP.
+        seed: random seed of COLMAP; without an EXIF focal length, the first of `MAPPINGS` seeds, of which the
+            reconstruction with most observations is taken.
         ignore: view name -> files of masks of pixels in which no features are searched.
 
     Returns:
@@ -103,7 +107,8 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
     turned = {name for name, path in photographs.items() if _is_portrait(image_size(path, upright=True))}
-    for group, focal in group_by_lens(photographs, work):
+    groups = group_by_lens(photographs, work)
+    for group, focal in groups:
         for name in group:
             image = load_resized(photographs[name], longest, upright=True)
             save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
@@ -112,7 +117,9 @@ def reconstruct(
                 save_mask(masks / f"{_file_of(name)}.png", np.rot90(mask) if name in turned else mask)
         _register(database, pictures, [_file_of(name) for name in group], focal)
     _match(database, pictures, masks if ignore else None, seed)
-    model = _reconstruct(database, pictures, work, seed)
+    mappings = MAPPINGS if any(focal is None for _, focal in groups) else 1
+    models = [_reconstruct(database, pictures, work, seed + k) for k in range(mappings)]
+    model = max(models, key=lambda each: each.compute_num_observations() if each else 0)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
     if len(placed) < LEAST_VIEWS:

@@ -7,8 +7,11 @@ path of the file, followed by the picture's file name, as if the file were a fol
 from __future__ import annotations
 
 import math
+import re
+from base64 import b64decode
 from collections.abc import Iterable
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +51,20 @@ def annotated_pictures(path: Path) -> list[str]:
         return sorted(_file_name(each) for each in record.get("images", ()) if each["id"] in named)
 
 
+def original_names(path: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return file name -> the original name of the picture, to which Roboflow adds a hash.
+
+    Args:
+        path: a COCO file, or a folder, which gives an empty result.
+        names: file names of pictures in the COCO file.
+    """
+    if not path.is_file():
+        return {}
+    with as_bad_input(path, KIND):
+        originals = {_file_name(each): _original_name(each) for each in _load(path)["images"]}
+        return {name: originals[name] for name in names}
+
+
 def annotation_size(path: Path) -> tuple[int, int]:
     """Return the (width, height) in px of the picture whose outlines are at `path`; raises BadInput if unreadable."""
     file, record = file_of(path), _load(file_of(path))
@@ -61,7 +78,7 @@ def annotation_size(path: Path) -> tuple[int, int]:
 def load_annotation(path: Path, categories: tuple[int, ...] = ()) -> np.ndarray:
     """Return the mask at `path`, bool [H, W], True inside the outlines.
 
-    Outlines themselves belong to the mask, as in labelme's own export. COCO's may be polygons or uncompressed runs.
+    Outlines themselves belong to the mask, as in labelme's own export. COCO's may be polygons or runs.
 
     Args:
         categories: numbers of the categories of a COCO file that are the object; empty if there is only one, and for
@@ -98,6 +115,14 @@ def _load_once(file: Path, _changed: int) -> dict[str, Any]:
 def _file_name(picture: dict[str, Any]) -> str:
     """Return a COCO file's name of a picture, relative, so that it can follow the path of the file."""
     return str(picture["file_name"]).replace("\\", "/").lstrip("/")
+
+
+def _original_name(picture: dict[str, Any]) -> str:
+    """Return the original name that Roboflow keeps, else `A.jpg` for `A_jpg.rf.HASH.jpg`, else the file name."""
+    match picture:
+        case {"extra": {"name": str(name)}}:
+            return name
+    return re.sub(r"_([^\W_]+)\.rf\.[^./]+\.\w+$", r".\1", _file_name(picture))
 
 
 def _picture(record: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -142,20 +167,60 @@ def _draw(path: Path, shapes: Iterable[dict[str, Any]], size: tuple[int, int]) -
         elif kind == "circle":
             radius = math.dist(*points)
             draw.circle(points[0], radius, fill=1, outline=1)
+        elif kind == "mask":
+            _paste_box(path, canvas, points, shape["mask"])
         else:
             raise BadInput(f"{path}: a {kind} of {len(points)} points is no area; draw polygons, rectangles or circles")
     return np.array(canvas) > 0
+
+
+def _paste_box(path: Path, canvas: Image.Image, points: list[tuple[float, ...]], png: str) -> None:
+    """Add the white pixels of labelme's mask of a box to the canvas.
+
+    Args:
+        points: the box's first and last pixel.
+        png: a PNG of the box, in base64.
+    """
+    box = Image.open(BytesIO(b64decode(png)))
+    (x, y), (right, bottom) = np.sort(points, axis=0).astype(int).tolist()
+    width, height = right - x + 1, bottom - y + 1
+    if box.size != (width, height):
+        raise BadInput(
+            f"{path}: a mask of {box.width} x {box.height} pixels in a box of {width} x {height}; draw it anew"
+        )
+    canvas.paste(1, (x, y), Image.fromarray(np.array(box) > 0))
 
 
 def _outline(path: Path, outline: Any, size: tuple[int, int]) -> np.ndarray:
     """Return the area of one annotation of a COCO file, bool [H, W]: polygons, or runs of columns."""
     if isinstance(outline, list) and outline:
         return _draw(path, [{"points": np.reshape(polygon, (-1, 2))} for polygon in outline], size)
-    if not outline or isinstance(outline["counts"], str):
-        kind = "compressed runs" if outline else "boxes without outlines"
-        raise BadInput(f"{path}: {kind} are not read; export polygons")
+    if not outline:
+        raise BadInput(f"{path}: boxes without outlines are not read; export polygons")
     runs = outline["counts"]
+    if isinstance(runs, str):
+        runs = _decompress(path, runs)
     if sum(runs) != size[0] * size[1]:
         raise BadInput(f"{path}: its runs cover {sum(runs)} pixels of {size[0] * size[1]}; export it anew")
     columns = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
     return columns.reshape(size).T
+
+
+def _decompress(path: Path, text: str) -> list[int]:
+    """Return the lengths of the runs in a text of pycocotools.
+
+    A character holds 5 bits of a number, low bits first, and a bit that says whether more follow. From the fourth on,
+    numbers are differences to the length two before.
+    """
+    runs: list[int] = []
+    number = shift = 0
+    for bits in (ord(character) - 48 for character in text):
+        number |= (bits & 0x1F) << shift
+        shift += 5
+        if not bits & 0x20:
+            number -= (bits & 0x10) << (shift - 4)  # the sign
+            runs.append(number + (runs[-2] if len(runs) > 2 else 0))
+            number = shift = 0
+    if shift or min(runs, default=0) < 0 or not all("0" <= character <= "o" for character in text):
+        raise BadInput(f"{path}: its compressed runs are damaged; export it anew")
+    return runs

@@ -41,7 +41,14 @@ def load_json(path: Path) -> Any:
         BadInput: the file is missing or not valid JSON. The message names the file.
     """
     with reading(path, "valid JSON"):
-        return json.loads(Path(path).read_bytes())
+        try:
+            return json.loads(Path(path).read_bytes())
+        except json.JSONDecodeError as error:
+            if error.doc.startswith(("//", "#", "/*"), error.pos):
+                raise BadInput(
+                    f"{path}: not valid JSON: line {error.lineno} has a comment, which JSON does not allow; remove it"
+                ) from None
+            raise
 
 
 def load_array(path: Path, what: str = "a readable array") -> np.ndarray:

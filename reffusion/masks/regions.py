@@ -9,7 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from reffusion import geometry, morphology
-from reffusion.types import Camera, Gaussians
+from reffusion.io.files import BadInput
+from reffusion.types import Camera, Gaussians, Scene
 
 SHOWN = 0.1  # rendered label of new Gaussians above which a pixel shows them
 CLOSED = 0.008  # of the image's width: gaps up to twice as wide are closed
@@ -88,6 +89,20 @@ def outside_sphere(center: np.ndarray, radius: float, camera: Camera) -> np.ndar
 def point_on_axis(camera: Camera, distance: float) -> np.ndarray:
     """Return [3], the world point on the camera's optical axis at this distance in front of the camera's center."""
     return camera.center + distance * camera.world_to_camera[2, :3]
+
+
+def check_region(region: Region, scene: Scene) -> None:
+    """Raise BadInput if the region lies in no training view; the message names places in the scene's own frame."""
+    cameras = [scene.cameras[name] for name in scene.train]
+    if any(silhouette(region, camera, np.zeros((camera.height, camera.width))).any() for camera in cameras):
+        return
+    middle = np.mean([camera.center for camera in cameras], 0)
+    center, middle = (scene.similarity.invert(place) for place in (np.asarray(region.center), middle))
+    write = lambda place: "[" + ", ".join(f"{number:.3g}" for number in place) + "]"
+    raise BadInput(
+        f"region: no view shows it; its center is {write(center)}, and the cameras are around {write(middle)}. "
+        "Is it in the unit and frame of the poses?"
+    )
 
 
 def inside_region(gaussians: Gaussians, region: Region) -> Tensor:

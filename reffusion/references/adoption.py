@@ -27,6 +27,9 @@ from reffusion.workspace import Workspace
 # in which they are blended into the photograph.
 PASTE_MARGIN, PASTE_BLEND = 0.01, 0.01
 LEAST_HOLE_SHARE = 0.9  # share of the invent mask that a reference must cover after alignment
+# A reference is unpainted if at least the share UNPAINTED of its hole differs by at most SAME (of 255) in each channel
+# from the photograph, or from the gray of the pictures that are offered for painting.
+UNPAINTED, SAME = 0.95, 6
 NEIGHBORS = 4  # nearest views with which a matching reference is compared, in case it shows one of them better
 
 
@@ -108,6 +111,8 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
         image, inside = undistort_reference(file, lens, photo, found.affine)
         image = color.recolor(image, found.gain, found.offset)
         usual = changes.redrawn_difference(image, photo, inside & ~hidden)
+    if has_photograph(space.poses, file.view) and file.view not in space.scene.clean:
+        check_painted(file, image, photo, masks)
     margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
     hole = hidden | detect_shadow(image, photo, hidden) & inside
     image = color.paste(image, photo, hole, inside, margin, blend)
@@ -152,6 +157,27 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
         warnings.warn(f"{problem}; taken all the same: scene.yaml says `trust: true`", stacklevel=1)
         return found if found.fits else replace(found, affine=None, gain=np.ones(3), offset=np.zeros(3))
     raise BadInput(f"{problem}; is it of another view, or of another scene? If it is right, {file.trust_hint}")
+
+
+def check_painted(file: ReferenceFile, image: np.ndarray, photo: np.ndarray, masks: MaskSet) -> None:
+    """Raise BadInput if a picture shows the object, or the gray of a hole that nobody has painted.
+
+    If scene.yaml says that the picture is trusted, nothing is checked.
+
+    Args:
+        file: the reference's files.
+        image: uint8 [H, W, 3], the picture after alignment.
+        photo: uint8 [H, W, 3], the photograph of its view, which shows the object.
+        masks: pixel classes of its view.
+    """
+    pixels = masks.consistent & masks.invent
+    if file.trust or not pixels.any():
+        return
+    looks_like = lambda other: (np.abs(image[pixels].astype(int) - other) <= SAME).all(-1).mean() >= UNPAINTED
+    problem = "shows the object, as its photograph does" if looks_like(photo[pixels]) else None
+    problem = "shows the gray of a hole that is not painted" if looks_like(view_ranking.GRAY) else problem
+    if problem:
+        raise BadInput(f"{file.path}: {problem}; paint what is behind the object. If it is right, {file.trust_hint}")
 
 
 def check_agreement(references: Sequence[Reference], space: Workspace) -> None:

@@ -21,6 +21,7 @@ LOOKED_AT = 24  # largest number of masks, spread evenly, with which each mask i
 RAYS, DEPTHS = 64, 128  # pixels of a mask, and points on the ray of each; many, since the object is short on a ray
 AGREE = 0.75  # share of the other masks that must contain a point, so that it may be on the object
 SUPPORTED = 0.3  # share of a mask's pixels with such a point; a mask with less shows something else
+WITHIN = 0.9  # share of the object's points that lie within a picture whose empty mask is then probably a mistake
 BLACK = 0.1  # a photograph is black if its brightness is less than this share of that of the others
 BRIGHTER = 1.5  # a photograph is odd if it is this many times as bright as the others, or as dark
 POINTS = 5000  # largest number of points at which photographs are compared
@@ -102,13 +103,13 @@ def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Return warnings about masks that mark something else in 3D than the other masks."""
+    """Return warnings about masks that mark something else in 3D than the other masks, or nothing where these do."""
     names = [name for name in scene.train if name in masks and name not in scene.clean]
     marked = [name for name in names if masks[name].any()]
     if len(marked) < 3:
         return []
     cameras = [scene.cameras[name] for name in names[:: -(-len(names) // LOOKED_AT)]]
-    share = {}
+    share, body = {}, [np.zeros((0, 3))]
     for name in marked:
         places = _along_rays(scene.cameras[name], masks[name], scene.points)
         inside, framed = np.zeros(places.shape[:2]), np.zeros(places.shape[:2])
@@ -118,7 +119,9 @@ def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[st
                 inside += hit & within
                 framed += within
         # some point on the pixel's ray projects into most of the masks whose pictures contain the point
-        supported = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
+        agreed = (inside >= AGREE * framed) & (framed >= 2)
+        supported = agreed.any(1)
+        body.append(np.average(places[supported], 1, np.repeat(agreed[supported][..., None], 3, 2)))
         judged = (framed >= 2).any(1)
         if judged.sum() >= RAYS // 4:
             share[name] = float(supported[judged].mean())
@@ -128,7 +131,22 @@ def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[st
             f"{len(alone)} of {len(share)} masks do not agree in 3D; do all mark the same object, and are the poses "
             "right?"
         ]
-    return [f"the mask of {name} shows something else than those of the other views do" for name in alone]
+    points, empty = np.concatenate(body), [name for name in names if name not in marked]
+    return [
+        *(f"the mask of {name} shows something else than those of the other views do" for name in alone),
+        *(
+            f"the mask of {name} is empty, though the object of the other masks lies in its view; is it hidden there?"
+            for name in empty
+            if _share_within(scene.cameras[name], points) > WITHIN
+        ),
+    ]
+
+
+def _share_within(camera: Camera, points: np.ndarray) -> float:
+    """Return the share in [0, 1] of the points [P, 3] that project into a view's picture; 0 without points."""
+    at, depth = project(points, camera)
+    inside = sample_nearest(np.ones((camera.height, camera.width), bool), at)[1] & (depth > 0)
+    return float(inside.sum() / max(len(points), 1))
 
 
 def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from reffusion.capture.layouts import colmap, transforms
 from reffusion.capture.layouts.capture import Poses
+from reffusion.capture.layouts.intrinsics import check_intrinsics
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
@@ -36,7 +37,7 @@ def read(folder: Path) -> tuple[Poses, Path] | None:
         without such files, the folder of the COLMAP model. None if the scene has neither.
 
     Raises:
-        BadInput: a file is wrong, as for a capture with pictures; or there are fewer than three cameras.
+        BadInput: a file or lens is wrong, as for a capture with pictures; or there are fewer than three cameras.
     """
     model = colmap.find_model(folder)
     if sources := transforms.split_files(folder):
@@ -47,4 +48,5 @@ def read(folder: Path) -> tuple[Poses, Path] | None:
         return None
     if len(poses.lenses) < LEAST:
         raise BadInput(f"{source}: {len(poses.lenses)} cameras; at least {LEAST} are needed")
+    check_intrinsics(poses.lenses, source)
     return poses, source

@@ -2,8 +2,8 @@
 
 A row holds the position of a camera (x, y, alt), its orientation in degrees, and its lens. Heading, pitch and roll of 0
 mean a camera that looks down the axis of alt, with the top of its picture towards y. The heading turns it clockwise as
-seen from above; pitch and roll turn it about its own x and y axis. The focal length is in mm for a picture whose longer
-side is 36 mm. The principal point is an offset from the picture's center, in units of the longer side.
+seen from above; pitch and roll turn it about its own x and y axis. The focal length and the principal point, an offset
+from the picture's center, are in mm for a picture whose longer side is 36 mm, as other readers of this file take them.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def _parse_row(row: dict[str, str], source: Path, line: int) -> PictureCamera:
         camera_to_world[:3, 3] = [float(row[name]) for name in ("x", "y", "alt")]
 
     def lens(size: tuple[int, int]) -> Lens:
-        (width, height), longer = size, max(size)
-        f, cx, cy = focal / 36 * longer, width / 2 + center[0] * longer, height / 2 + center[1] * longer
+        (width, height), px_per_mm = size, max(size) / 36
+        f, cx, cy = focal * px_per_mm, width / 2 + center[0] * px_per_mm, height / 2 + center[1] * px_per_mm
         return Lens(width, height, f, f, cx, cy, tuple(radial), tangential=tangential, model="RealityCapture")
 
     return PictureCamera(invert_pose(camera_to_world), lens)

@@ -108,7 +108,7 @@ def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) ->
     source = next(iter(sources.values()))
     files = _find_pictures(folder, images, frames)
     if not files:
-        raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; name their folder as `images`")
+        raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; {_find_remedy(folder)}")
     missing = [frame.file_path for k, frame in enumerate(frames) if k not in files]
     root = Path(os.path.commonpath([path.parent for path in files.values()]))
     of_path, repeated = _drop_repeated((path.relative_to(root).as_posix(), frames[k]) for k, path in files.items())
@@ -194,8 +194,10 @@ def _load_frames(source: Path, split: str) -> list[Frame]:
 def _frames(record: object, source: Path) -> list[dict]:
     """Return the frames of a parsed transforms file, its list `frames` or the file itself; raises BadInput if wrong."""
     frames = record.get("frames") if isinstance(record, dict) else record
-    if not isinstance(frames, list) or not frames:
+    if not isinstance(frames, list):
         raise BadInput(f"{source}: it has no list `frames`")
+    if not frames:
+        raise BadInput(f"{source}: its list `frames` is empty; export the poses again")
     for frame in frames:
         if not isinstance(frame, dict) or not frame.keys() & {MATRIX, EXPORTED} or not _is_path(frame.get("file_path")):
             raise BadInput(f"{source}: a frame without file_path or transform_matrix: {shorten(frame)}")
@@ -271,6 +273,17 @@ def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dic
     return {}
 
 
+def _find_remedy(folder: Path) -> str:
+    """Return what the user may do if no frame has a picture, as a part of a sentence."""
+    odd = min((path.name for path in folder.iterdir() if "\\" in path.name), default=None)
+    if odd is None:
+        return "name their folder as `images`"
+    return (
+        f"the folder holds files called `{odd}`, as some unzip programs write archives made on Windows; unpack it again "
+        "with another program"
+    )
+
+
 def _unlisted_pictures(root: Path, listed: Sequence[Path]) -> list[str]:
     """Return the pictures, relative to `root`, that lie beside those of the frames and that no frame lists, sorted."""
     folders = {path.parent for path in listed if root in path.parents}
@@ -289,9 +302,13 @@ def _existing_picture(folder: Path, listed: str) -> Path | None:
 
 def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[str, Path]:
     """Return view name -> the existing file that its frame names under `key`, such as mask_path or depth_file_path."""
-    named = {view: each.values[key] for view, each in placed.items() if _is_path(each.values.get(key))}
-    files = {view: folder / path.replace("\\", "/") for view, path in named.items()}
+    files = {view: folder / path.replace("\\", "/") for view, path in _listed_paths(placed, key).items()}
     return {view: path for view, path in files.items() if path.is_file()}
+
+
+def _listed_paths(placed: Mapping[str, Frame], key: str) -> dict[str, str]:
+    """Return view name -> the path, perhaps of a missing file, that its frame names under `key`."""
+    return {view: each.values[key] for view, each in placed.items() if _is_path(each.values.get(key))}
 
 
 def _frame_pose(frame: Frame, name: str) -> np.ndarray:
@@ -325,7 +342,14 @@ def _points(
         messages.append(f"{path}: named by {source.name}, but missing")
     # without points in the frame of the poses, points are made from depth maps
     in_poses = {view: each for view, each in placed.items() if view in poses.lenses}  # a correction may leave out views
-    if depths := _named_files(folder, in_poses, "depth_file_path"):
+    listed_depths = _listed_paths(in_poses, "depth_file_path")
+    depths = _named_files(folder, in_poses, "depth_file_path")
+    if lost := [path for view, path in listed_depths.items() if view not in depths]:
+        messages.append(
+            f"{len(lost)} of {len(listed_depths)} files of depth_file_path in {source.name} are missing "
+            f"(first: {shorten(lost[0])})"
+        )
+    if depths:
         scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
         depth_points = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
         points_in_frame, refused = keep_points_in_frame(

@@ -37,7 +37,8 @@ def load_frame_lens(values: dict[str, Any], picture: Path, source: Path) -> Lens
     """
     width, height = image_size(picture)
     lens = frame_lens(values, picture, source, (width, height))
-    if not {"w", "h"} & values.keys() and not (0.25 < lens.cx / width < 0.75 and 0.25 < lens.cy / height < 0.75):
+    central = 0.25 < lens.cx / width < 0.75 and 0.25 < lens.cy / height < 0.75
+    if not {"w", "h"} & values.keys() and not central and (lens.cx or lens.cy):  # zeros: see `check_intrinsics`
         raise BadInput(
             f"{source}: cx, cy = {lens.cx:g}, {lens.cy:g} for '{picture.name}' of {width}x{height} px: they are "
             "those of another size; add that size as w and h"
@@ -76,6 +77,10 @@ def read_number(values: dict[str, Any], key: str, default: float, picture: Path,
         BadInput: the value is no number, is NaN, or has an absolute value of 1e12 or more.
     """
     value = values.get(key, default)
+    if isinstance(value, str):
+        raise BadInput(
+            f"{source}: {key} = \"{shorten(value)}\" of '{picture.name}' is text; write the number without quotes"
+        )
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
         raise BadInput(f"{source}: {key} = {shorten(value)} of '{picture.name}' is no finite number")
     return float(value)
@@ -85,15 +90,12 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
     """Return `frame_lens`, before sizes and focal lengths are checked to be positive."""
     number = lambda key, default=0.0: read_number(values, key, default, picture, source)
     width, height = number("w", size[0]), number("h", size[1])
+    model = _camera_model(values, source)
     fx = _focal_length(values, "x", width, number)
     if fx is None:
         raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; add one of them to the file")
     fy = _focal_length(values, "y", height, number)
-    model = values.get("camera_model", "OPENCV")
-    model = model.upper() if isinstance(model, str) else shorten(model)
     fisheye = "FISHEYE" in model or bool(values.get("is_fisheye", False))
-    if model not in MODELS:
-        raise BadInput(f"{source}: camera_model {shorten(model)} is not understood; one of {', '.join(MODELS)}")
     k = [number(f"k{i}") for i in range(1, 7)]
     rational = model == "FULL_OPENCV"
     return Lens(
@@ -109,6 +111,20 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
         fisheye=fisheye,
         model=model,
     )
+
+
+def _camera_model(values: dict[str, Any], source: Path) -> str:
+    """Return the name of a frame's camera model, one of `MODELS`; raises BadInput for another."""
+    model = values.get("camera_model", "OPENCV")
+    model = model.upper() if isinstance(model, str) else shorten(model)
+    if model == "EQUIRECTANGULAR":
+        raise BadInput(
+            f"{source}: camera_model {model} means 360-degree panoramas; cut them into perspective views: "
+            f"`reffusion panoramas {source.parent}`"
+        )
+    if model not in MODELS:
+        raise BadInput(f"{source}: camera_model {shorten(model)} is not understood; one of {', '.join(MODELS)}")
+    return model
 
 
 def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Callable[..., float]) -> float | None:

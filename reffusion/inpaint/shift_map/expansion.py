@@ -76,7 +76,6 @@ def choose_candidates(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> 
     Returns:
         [N] int, the index of the candidate of each pixel.
     """
-
     first, second = pairs.T
 
     def seam_cost(at_first: np.ndarray, at_second: np.ndarray) -> np.ndarray:
