@@ -14,7 +14,7 @@ import numpy as np
 
 from reffusion import trace
 from reffusion.capture import normalized_frame, sfm
-from reffusion.capture.checks.sanity import find_odd_exposures
+from reffusion.capture.checks.sanity import find_odd_photographs
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.own_splats import OwnSplats, load_own_splats
@@ -101,7 +101,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     load_one = lambda name: load_views(out, [name])[name]
-    _save_warnings(out, [*messages, *contradictions, *find_odd_exposures(normalized, load_one)])
+    _save_warnings(out, [*messages, *contradictions, *find_odd_photographs(normalized, load_one)])
     normalized = complete_points(normalized, capture.poses, pinholes, partial(load_views, out))
     save_scene(out, normalized)
     if own_splats is not None:

@@ -517,7 +517,7 @@ COLMAP_TEXT: dict[str, tuple[str, Change]] = {
         f"camera: {line!r:.40}": (names, write_file(f"{MODEL}/cameras.txt", line + "\n"))
         for names, line in (
             ("SIMPLE_RADIAL", "1 SIMPLE_RADIAL 96 72 90 48 36 -9"),
-            ("OPENCV_FISHEYE", "1 OPENCV_FISHEYE 96 72 10 10 48 36 0 0 0 0"),
+            ("OPENCV_FISHEYE", "1 OPENCV_FISHEYE 96 72 20 20 48 36 0 0 0 0"),
             ("v00.png", "1 SIMPLE_PINHOLE 500 72 90 48 36"),
         )
     },

@@ -1,8 +1,10 @@
-"""Captures with uncommon COLMAP models, views in folders, and Blender's files."""
+"""Captures with uncommon COLMAP models, views in folders, and Blender's files; wrong intrinsics and transforms.json."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from scenes.capture import (
     WIDTH,
     Truth,
     make_truth,
+    write_capture,
     write_masks,
     write_model,
     write_pictures,
@@ -32,7 +35,9 @@ from scenes.capture_checks import (
     write_named_model,
 )
 
+from reffusion.capture.layouts import cameras
 from reffusion.capture.load import load_capture
+from reffusion.io.files import BadInput
 from reffusion.io.scene import list_objects
 
 
@@ -218,3 +223,131 @@ def test_training_file_alone_has_no_test_views(tmp_path):
     scene, _, _ = run_with_messages(folder, masks="none", layout="transforms")
     assert len(scene.train) == 6 and scene.test == ()
     assert_cameras(scene, truth)
+
+
+# ------------------------------------------------------------------------------------------------- wrong intrinsics
+
+IN_PIXELS = r"the focal length of 8 px means a field of view of {} degrees; is it in millimeters\? It must be in pixels"
+AT = r"the principal point \(cx, cy = {}\) "
+OTHER_SIZE = r"lies {} the picture of 96x72 px: are fl, cx and cy those of another size\? Give w and h of that size"
+CORNER = "is in the picture's corner; give its middle in pixels, or leave cx and cy out"
+INTRINSICS: dict[str, tuple[dict[str, object], str]] = {
+    "millimeters": ({"fl_x": 8.0, "fl_y": 8.0}, IN_PIXELS.format(161)),
+    "millimeters of a fisheye": ({"fl_x": 8.0, "fl_y": 8.0, "is_fisheye": True}, IN_PIXELS.format(688)),
+    "of a picture 4 times as large": (
+        {"cx": 192.0, "cy": 145.0},
+        AT.format("192, 145") + OTHER_SIZE.format("outside of"),
+    ),
+    "of a picture twice as large": (
+        {"cx": 95.0, "cy": 70.0},
+        AT.format("95, 70") + OTHER_SIZE.format("in the corner of"),
+    ),
+    "cx alone": ({"cx": 150.0}, AT.format("150, [0-9]+") + OTHER_SIZE.format("outside of")),
+    "zero": ({"cx": 0.0, "cy": 0}, AT.format("0, 0") + CORNER),
+    "relative": ({"cx": 0.5, "cy": 0.5}, AT.format("0.5, 0.5") + CORNER),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), INTRINSICS.values(), ids=INTRINSICS.keys())
+def test_intrinsics_that_no_camera_has(tmp_path, changes, message):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    change_transforms(folder, lambda record: record.update(changes))
+    with pytest.raises(BadInput, match=rf"transforms\.json: view 'v0.': {message}"):
+        load_capture(folder)
+    with pytest.raises(BadInput, match=rf"transforms\.json: view 'v0.': {message}"):
+        cameras.read(folder)
+
+
+def test_zero_principal_point_without_a_size(tmp_path):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    change_transforms(folder, lambda record: [record.pop("w"), record.pop("h"), record.update(cx=0.0, cy=0.0)])
+    with pytest.raises(BadInput, match=CORNER):
+        load_capture(folder)
+
+
+def test_intrinsics_of_a_colmap_model_that_no_camera_has(tmp_path):
+    folder = write_capture(tmp_path, "colmap", make_truth(("PINHOLE", (90.0, 90.0, 192.0, 144.0))))
+    with pytest.raises(BadInput, match=OTHER_SIZE.format("outside of")):
+        load_capture(folder)
+
+
+UNCOMMON: dict[str, list[dict[str, object]]] = {
+    "140 degrees": [{"fl_x": 17.5, "fl_y": 17.5}],
+    "fisheye of 200 degrees": [{"fl_x": 27.5, "fl_y": 27.5, "camera_model": "OPENCV_FISHEYE"}],
+    "pictures reduced to a quarter": [{"w": 384, "h": 288, "cx": 192.0, "cy": 144.0, "fl_x": 360.0, "fl_y": 360.0}],
+    "crop beside the middle": [{"cx": 110.0, "cy": 36.0}],
+    "crops below the middle": [{"cx": 40.0 + 5 * k, "cy": -100.0} for k in range(6)],
+    "four tiles of a picture": [{"cx": cx, "cy": cy} for cy in (72.0, 0.0) for cx in (96.0, 0.0)],
+}
+
+
+@pytest.mark.parametrize("changes", UNCOMMON.values(), ids=UNCOMMON.keys())
+def test_uncommon_intrinsics_are_read(tmp_path, changes):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    change_transforms(
+        folder, lambda record: [f.update(changes[k % len(changes)]) for k, f in enumerate(record["frames"])]
+    )
+    capture = load_capture(folder)
+    assert len(capture.pictures) == 6 and not capture.warnings
+
+
+# ----------------------------------------------------------------------------------------------- wrong transforms.json
+
+
+def change_transforms(folder: Path, change: Callable[[dict], object]) -> None:
+    record = json.loads((folder / "transforms.json").read_text())
+    change(record)
+    (folder / "transforms.json").write_text(json.dumps(record))
+
+
+WRONG: dict[str, tuple[Callable[[dict], object], str]] = {
+    "text": (
+        lambda record: record.update(fl_x="90.5"),
+        "fl_x = \"90.5\" of 'v00.png' is text; write the number without quotes",
+    ),
+    "no frames": (lambda record: record.update(frames=[]), "its list `frames` is empty; export the poses again"),
+    "panoramas": (
+        lambda record: [record.update(camera_model="equirectangular"), record.pop("fl_x")],
+        "camera_model EQUIRECTANGULAR means 360-degree panoramas; cut them into perspective views: `reffusion panorama",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG.values(), ids=WRONG.keys())
+def test_message_says_what_is_wrong_in_transforms_json(tmp_path, change, message):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    change_transforms(folder, change)
+    with pytest.raises(BadInput, match=rf"transforms\.json: {re.escape(message)}"):
+        load_capture(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"), [("{", "// by hand\n{", 1), ("{", "{\n # lens\n", 2), ("],", "], /* all */", 1)]
+)
+def test_comments_in_transforms_json(tmp_path, old, new, line):
+    file = write_capture(tmp_path, "transforms", make_truth()) / "transforms.json"
+    file.write_text(file.read_text().replace(old, new, 1))
+    message = rf"transforms\.json: not valid JSON: line {line} has a comment, which JSON does not allow; remove it"
+    with pytest.raises(BadInput, match=message):
+        load_capture(tmp_path)
+
+
+def test_names_with_backslashes_from_an_archive(tmp_path):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    for path in sorted((folder / "images").iterdir()):
+        path.rename(folder / rf"images\{path.name}")
+    message = r"the folder holds files called `images\\v00.png`, as some unzip programs write archives made on Windows"
+    with pytest.raises(BadInput, match=f"none of its 6 frames has a picture; {message}; unpack it again with another"):
+        load_capture(folder)
+
+
+def test_missing_depth_maps_are_named(tmp_path):
+    folder = write_capture(tmp_path, "transforms", make_truth())
+    name = lambda frame: frame.update(depth_file_path=frame["file_path"].replace("images", "depth"))
+    change_transforms(folder, lambda record: [name(frame) for frame in record["frames"][:4]])
+    message = "{} of 4 files of depth_file_path in transforms.json are missing (first: depth/v0{}.png)"
+    assert load_capture(folder).warnings == (message.format(4, 2),)
+    (folder / "depth").mkdir()
+    depth = np.linspace(3000, 5000, WIDTH).astype(np.uint16)[None].repeat(HEIGHT, 0)
+    Image.fromarray(depth).save(folder / "depth/v05.png")
+    assert load_capture(folder).warnings[0] == message.format(3, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scenes import wall_scene
@@ -13,7 +14,7 @@ from scenes.wall_scene import front_camera
 
 from reffusion import geometry
 from reffusion.capture.checks import sanity
-from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
+from reffusion.capture.checks.sanity import find_odd_masks, find_odd_photographs
 from reffusion.capture.image_detail import sample_visible
 from reffusion.capture.load import load_capture
 from reffusion.geometry import pixel_rays
@@ -34,7 +35,7 @@ def wall_capture(tmp_path_factory):
 
 
 def describe_oddities(scene, masks, pictures) -> str:
-    return "; ".join([*find_odd_masks(scene, masks), *find_odd_exposures(scene, pictures.__getitem__)])
+    return "; ".join([*find_odd_masks(scene, masks), *find_odd_photographs(scene, pictures.__getitem__)])
 
 
 def test_a_good_capture_has_no_warning(wall_capture):
@@ -48,6 +49,19 @@ def test_inverted_masks(wall_capture):
     assert "the masks cover 9" in describe_oddities(scene, {name: ~mask for name, mask in masks.items()}, pictures)
     one = describe_oddities(scene, masks | {"a1": ~masks["a1"]}, pictures)
     assert "the mask of a1 covers more than 50%" in one and "inverted?" in one
+
+
+def test_a_blurred_photograph_is_named(wall_capture):
+    scene, masks, pictures = wall_capture
+    draws = np.random.default_rng(0)
+    grain = {
+        name: (each * 0.2 + draws.integers(0, 150, each.shape)).astype(np.uint8) for name, each in pictures.items()
+    }
+    assert describe_oddities(scene, masks, grain) == ""
+    blurred = grain | {"a2": cv2.GaussianBlur(grain["a2"], (0, 0), 3)}
+    assert describe_oddities(scene, masks, blurred) == (
+        "blurred photographs: a2; leave them out by `exclude: [a2]` in scene.yaml"
+    )
 
 
 def test_masks_that_disagree_in_3d(wall_capture):

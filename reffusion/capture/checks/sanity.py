@@ -23,16 +23,17 @@ AGREE = 0.75  # share of the other masks that must contain a point, so that it m
 SUPPORTED = 0.3  # share of a mask's pixels with such a point; a mask with less shows something else
 WITHIN = 0.9  # share of the object's points that lie within a picture whose empty mask is then probably a mistake
 BLACK = 0.1  # a photograph is black if its brightness is less than this share of that of the others
+BLURRED = 0.4  # a photograph is blurred if its contrast is less than this share of that of the others; sharp ones .76
 BRIGHTER = 1.5  # a photograph is odd if it is this many times as bright as the others, or as dark
 POINTS = 5000  # largest number of points at which photographs are compared
 LEAST_SEEN = 50  # points that must be visible in a view to judge it
 
 
-def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """Return a warning about photographs that are much brighter or darker than the other photographs.
+def find_odd_photographs(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """Return warnings about photographs that are much darker, brighter or more blurred than the other photographs.
 
-    Brightness is compared at points that several views see. The views are training and test views without suspects
-    (views whose photographs contradict their poses).
+    Brightness and contrast are compared at points that several views see. The views are training and test views without
+    suspects (views whose photographs contradict their poses).
 
     Args:
         scene: undistorted views in the normalized frame. Its points must be sparse points or points from optical flow,
@@ -40,24 +41,28 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
         image_of: function from a view's name to its picture, uint8 [H, W, 3].
 
     Returns:
-        A list with one sentence about all such photographs; empty if there are none, or too few points or views.
+        At most one sentence for each fault; empty if there are no such photographs, or too few points or views.
     """
     cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
     points = scene.points[:: max(1, -(-len(scene.points) // POINTS))]
     if len(points) < LEAST_SEEN or len(cameras) < 3:
         return []
-    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P]
+    seen = np.stack([_looks(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P, 2]
     known = ~np.isnan(seen)
-    total, count = np.where(known, seen, 0).sum(0), known.sum(0)
-    ratios = {}
-    for camera, own, here in zip(cameras, seen, known & (count > 1), strict=True):
+    total, count = np.where(known, seen, 0).sum(0), known[..., 0].sum(0)
+    brightness, contrast = {}, {}
+    for camera, own, here in zip(cameras, seen, known[..., 0] & (count > 1), strict=True):
         if here.sum() >= LEAST_SEEN:
-            others = (total - own)[here] / (count[here] - 1)
-            ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
+            others = (total - own)[here] / (count[here, None] - 1)
+            brightness[camera.name], contrast[camera.name] = np.median((own[here] + 4) / (others + 4), 0).tolist()
+    return [*_warn_exposures(brightness), *_warn_blurred(contrast, brightness)]
+
+
+def _warn_exposures(ratios: Mapping[str, float]) -> list[str]:
+    """Return warnings for views whose brightness, relative to that of the other views, is far from 1."""
     jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
     dark = sorted(name for name, ratio in jumps.items() if ratio < BLACK)
-    remedy = f"leave them out by `exclude: [{', '.join(dark)}]` in scene.yaml"
-    black = [f"black photographs: {_join_names(dark)}; {remedy}"] if dark else []
+    black = [f"black photographs: {_join_names(dark)}; {_leave_out(dark)}"] if dark else []
     jumps = {name: ratio for name, ratio in jumps.items() if name not in dark}
     if not jumps:
         return black
@@ -68,6 +73,16 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
         f"{who} exposed otherwise than the rest ({_join_names(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
         "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)",
     ]
+
+
+def _warn_blurred(contrast: Mapping[str, float], brightness: Mapping[str, float]) -> list[str]:
+    """Return at most one warning, for views with little contrast relative to the others, dark ones left out."""
+    blurred = sorted(name for name, ratio in contrast.items() if ratio < BLURRED < brightness[name])
+    return [f"blurred photographs: {_join_names(blurred)}; {_leave_out(blurred)}"] if blurred else []
+
+
+def _leave_out(names: Iterable[str]) -> str:
+    return f"leave them out by `exclude: [{', '.join(names)}]` in scene.yaml"
 
 
 def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
@@ -165,10 +180,12 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 # ---------------------------------------------------------------------------------------------- photographs
 
 
-def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Return [P], the smoothed brightness of a photograph at the projections of points [P, 3]; NaN if not visible."""
+def _looks(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Return [P, 2], brightness and contrast (length of the gradient) at the points [P, 3]; NaN if not visible."""
     gray = to_gray(image)
-    return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
+    contrast = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+    window = (max(3, camera.width // 40),) * 2
+    return sample_visible(camera, points, cv2.blur(np.stack([gray, contrast], -1), window))
 
 
 def _join_names(names: Iterable[str], most: int = 4) -> str:

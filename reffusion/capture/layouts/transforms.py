@@ -279,8 +279,8 @@ def _find_remedy(folder: Path) -> str:
     if odd is None:
         return "name their folder as `images`"
     return (
-        f"the folder holds files called `{odd}`, as some unzip programs write archives made on Windows; unpack it again "
-        "with another program"
+        f"the folder holds files called `{odd}`, as some unzip programs write archives made on Windows; unpack it "
+        "again with another program"
     )
 
 
