@@ -61,9 +61,11 @@ def test_copies_are_named_and_placeholders_of_icloud_are_refused(tmp_path):
     first = min((tmp_path / "images").iterdir())
     shutil.copy(first, tmp_path / "images/copy.png")
     (warning,) = load_capture(tmp_path).warnings
-    assert warning.startswith("1 photographs are copies, such as") and "copy.png" in warning
+    assert warning.startswith("copies among the photographs (1, such as ") and "copy.png" in warning
     (tmp_path / "images/.IMG_1.HEIC.icloud").touch()
-    with pytest.raises(BadInput, match=r"images: 1 files are placeholders of iCloud, such as .IMG_1.HEIC.icloud"):
+    with pytest.raises(
+        BadInput, match=r"images: placeholders of iCloud in place of photographs \(1, such as .IMG_1.HEIC.icloud"
+    ):
         load_capture(tmp_path)
 
 

@@ -27,8 +27,8 @@ def read(folder: Path, images: str | None, references: frozenset[Path] = frozens
     image_folder = find_image_folder(folder, images, IMAGE_FOLDERS)
     if waiting := sorted(path.name for path in image_folder.glob(".*.icloud")):
         raise BadInput(
-            f"{image_folder}: {len(waiting)} files are placeholders of iCloud, such as {waiting[0]}; download the "
-            "photographs first, or remove the placeholders"
+            f"{image_folder}: placeholders of iCloud in place of photographs ({len(waiting)}, such as {waiting[0]}); "
+            "download the photographs first, or remove the placeholders"
         )
     found = find_pictures(image_folder, nested=not has_pictures(image_folder))
     pictures = {name: path for name, path in found.items() if path not in references}
@@ -47,4 +47,4 @@ def _warn_of_copies(pictures: dict[str, Path]) -> tuple[str, ...]:
         others = by_size.setdefault(path.stat().st_size, [])
         copies += [f"{path.name} of {other.name}" for other in others if filecmp.cmp(path, other, shallow=False)][:1]
         others.append(path)
-    return (f"{len(copies)} photographs are copies, such as {copies[0]}; remove them",) if copies else ()
+    return (f"copies among the photographs ({len(copies)}, such as {copies[0]}); remove them",) if copies else ()
