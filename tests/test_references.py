@@ -44,10 +44,10 @@ from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
-from reffusion.references import agreement, color, registration, view_ranking
+from reffusion.references import adoption, agreement, color, registration, view_ranking
 from reffusion.references.files import ReferenceFile
 from reffusion.references.undistort import undistort_reference, undistort_reference_depth
-from reffusion.types import Reference
+from reffusion.types import MaskSet, Reference
 from runner.execute import run_scene
 from runner.fleet.maintenance import clean
 from runner.keys import Hashes, code_fingerprints
@@ -146,6 +146,14 @@ def test_a_reference_that_nobody_painted_is_refused(wall_folders, tmp_path, show
     save_image(wall_folders["scene"] / "ref.png", np.where(hole, np.uint8(128), photo) if shown == "gray" else photo)
     with pytest.raises(BadInput, match=rf"ref.png: shows the {shown}.*; paint what is behind.* `trust: true`"):
         run_reference_stage(wall_folders, tmp_path / "out", **entry)
+
+
+def test_a_hole_that_surrounds_what_stays_may_show_its_photograph(tmp_path):
+    photo, hole = natural_noise(0), ~object_mask()
+    file = ReferenceFile("v", tmp_path / "v.png")
+    adoption.check_painted(file, photo, photo, MaskSet(hole, hole, hole, hole))
+    with pytest.raises(BadInput, match="shows the object"):
+        adoption.check_painted(file, photo, photo, MaskSet(~hole, ~hole, ~hole, ~hole))
 
 
 def test_where_no_photograph_has_a_hole_a_reference_is_asked_for(wall_folders, tmp_path):

@@ -162,7 +162,8 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
 def check_painted(file: ReferenceFile, image: np.ndarray, photo: np.ndarray, masks: MaskSet) -> None:
     """Raise BadInput if a picture shows the object, or the gray of a hole that nobody has painted.
 
-    If scene.yaml says that the picture is trusted, nothing is checked.
+    Nothing is checked if scene.yaml says that the picture is trusted, or if the hole takes more than half of the
+    picture's border: then it surrounds what stays, and photographs may show what belongs there.
 
     Args:
         file: the reference's files.
@@ -171,7 +172,8 @@ def check_painted(file: ReferenceFile, image: np.ndarray, photo: np.ndarray, mas
         masks: pixel classes of its view.
     """
     pixels = masks.consistent & masks.invent
-    if file.trust or not pixels.any():
+    border = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
+    if file.trust or not pixels.any() or border.mean() > 0.5:
         return
     looks_like = lambda other: (np.abs(image[pixels].astype(int) - other) <= SAME).all(-1).mean() >= UNPAINTED
     problem = "shows the object, as its photograph does" if looks_like(photo[pixels]) else None
