@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 LEAST_VIEWS = 3  # smallest number of views for which poses must be found
-# Times that photographs without a focal length are mapped, from other random seeds: from a wrong start the mapping can
-# end in cameras that explain the matches in part only.
-MAPPINGS = 3
+# Photographs without a focal length are mapped from several seeds, at most MAPPINGS, until two mappings agree in their
+# number of observations (ratio AGREE): a mapping can end in cameras that explain the matches only in part.
+MAPPINGS, AGREE = 3, 0.9
 LEAST_SIGHTINGS = 100  # a view with fewer observations is not adjusted
 SAME_FOCAL = 1.01  # ratio of EXIF focal lengths up to which photographs count as taken at one zoom
 EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: camera settings (a part of the tags), maker, model
@@ -88,8 +88,7 @@ def reconstruct(
         photographs: view name -> file; sizes may differ.
         longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
         work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
-        seed: random seed of COLMAP; without an EXIF focal length, the first of `MAPPINGS` seeds, of which the
-            reconstruction with most observations is taken.
+        seed: random seed of COLMAP; the first one if some photographs have no EXIF focal length, see `MAPPINGS`.
         ignore: view name -> files of masks of pixels in which no features are searched.
 
     Returns:
@@ -117,9 +116,8 @@ def reconstruct(
                 save_mask(masks / f"{_file_of(name)}.png", np.rot90(mask) if name in turned else mask)
         _register(database, pictures, [_file_of(name) for name in group], focal)
     _match(database, pictures, masks if ignore else None, seed)
-    mappings = MAPPINGS if any(focal is None for _, focal in groups) else 1
-    models = [_reconstruct(database, pictures, work, seed + k) for k in range(mappings)]
-    model = max(models, key=lambda each: each.compute_num_observations() if each else 0)
+    map_views = _reconstruct if all(focal for _, focal in groups) else _reconstruct_repeatedly
+    model = map_views(database, pictures, work, seed)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
     if len(placed) < LEAST_VIEWS:
@@ -173,6 +171,17 @@ def _reconstruct(database: Path, pictures: Path, work: Path, seed: int, is_rig: 
     options.mapper.num_threads = 1  # fixes the order of sums, and so the result
     models = pycolmap.incremental_mapping(database, pictures, work, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _reconstruct_repeatedly(database: Path, pictures: Path, work: Path, seed: int):
+    """Return the `pycolmap.Reconstruction` with most observations of up to `MAPPINGS` seeds, or None."""
+    models, observations = [], lambda model: model.compute_num_observations() if model else 0
+    for k in range(MAPPINGS):
+        models.append(_reconstruct(database, pictures, work, seed + k))
+        best, *others = sorted(map(observations, models), reverse=True)
+        if others and others[0] >= AGREE * best > 0:
+            break
+    return max(models, key=observations)
 
 
 def _is_portrait(size: tuple[int, int]) -> bool:
