@@ -130,7 +130,7 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, poses: Path) -> list
     outcomes = {
         True: "parts of the object that no mask covers are removed, too, because they would float in the air (to keep "
         "them: `--set masks.remnants=false`)",
-        False: "parts of the object seem to be left; if so, mark them in these views and run again",
+        False: "parts of the object seem to be left; if so, mark them in every view that shows them",
     }
     return [f"{outcomes[floats]}: {'; '.join(texts)}" for floats, texts in described.items() if texts]
 
