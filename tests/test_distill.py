@@ -476,7 +476,7 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(stage_folders)
 
     picture = load_image(stage_folders["poses"] / "images" / "a.png")
     save_image(stage_folders["scene"] / "done" / "a.png", picture)
-    params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png"})
+    params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png", "trust": True})
     assert "reference a:" in plan.preview(params, **select_folders(stage_folders, "scene", "poses"))[0]
     reference.run(params, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks"))
     assert (load_image(stage_folders["reference"] / "references" / "a.png") == picture).all()

@@ -141,7 +141,7 @@ def test_a_picture_that_teaches_reaches_personalization_only(tmp_path):
         found, adapted = tmp_path / f"reference-{number}", tmp_path / f"personalize-{number}"
         found.mkdir()
         adapted.mkdir()
-        params = reference.Params(reference={"view": "a2", "image": "images/a2.png"}, teach=teach)
+        params = reference.Params(reference={"view": "a2", "image": "images/a2.png", "trust": True}, teach=teach)
         reference.run(params, found, **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
         assert [each.camera.name for each in load_references(found, load_scene(poses))] == ["a2"]
         params = personalize.Params(prior=str(paths["prior"]), steps=2, lora={"rank": 2})
@@ -158,7 +158,7 @@ def test_without_overlap_new_gaussians_lie_in_the_hole(tmp_path):
     wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
     paths["reference"].mkdir()
     run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
-    spec = {"view": "a2", "image": "images/a2.png"}
+    spec = {"view": "a2", "image": "images/a2.png", "trust": True}
     needs = {k: paths[k] for k in ("scene", "poses", "fit", "masks")}
     reference.run(reference.Params(reference=spec), paths["reference"], **needs)
     scene, hole = load_scene(poses), load_mask_sets(paths["masks"], ["a2"])["a2"].consistent
