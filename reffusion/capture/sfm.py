@@ -88,7 +88,8 @@ def reconstruct(
         photographs: view name -> file; sizes may differ.
         longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
         work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
-        seed: random seed of COLMAP; the first one if some photographs have no EXIF focal length, see `MAPPINGS`.
+        seed: random seed of COLMAP. If photographs lack an EXIF focal length, it is that of the first mapping
+            (`_reconstruct_repeatedly`).
         ignore: view name -> files of masks of pixels in which no features are searched.
 
     Returns:

@@ -23,7 +23,8 @@ AGREE = 0.75  # share of the other masks that must contain a point, so that it m
 SUPPORTED = 0.3  # share of a mask's pixels with such a point; a mask with less shows something else
 WITHIN = 0.9  # share of the object's points that lie within a picture whose empty mask is then probably a mistake
 BLACK = 0.1  # a photograph is black if its brightness is less than this share of that of the others
-BLURRED = 0.4  # a photograph is blurred if its contrast is less than this share of that of the others; sharp ones .76
+# A photograph is blurred if its contrast is less than this share of that of the others. Sharp ones have .76 or more.
+BLURRED = 0.4
 BRIGHTER = 1.5  # a photograph is odd if it is this many times as bright as the others, or as dark
 POINTS = 5000  # largest number of points at which photographs are compared
 LEAST_SEEN = 50  # points that must be visible in a view to judge it
@@ -82,6 +83,7 @@ def _warn_blurred(contrast: Mapping[str, float], brightness: Mapping[str, float]
 
 
 def _leave_out(names: Iterable[str]) -> str:
+    """Return the remedy, which names the line of scene.yaml that leaves these views out."""
     return f"leave them out by `exclude: [{', '.join(names)}]` in scene.yaml"
 
 
