@@ -335,7 +335,7 @@ YAML = {
     "reference twice": "reference: [{view: v00, image: images/v00.png}, {view: v00, image: images/v01.png}]",
     "reference of a test view": "test: [v00]\nreference: {view: v00, image: images/v00.png}",
     "reference of neither": "train: [v00, v01, v02]\nreference: {view: v03, image: images/v03.png}",
-    "reference undistorted perhaps": "reference: {view: v00, image: images/v00.png, undistorted: perhaps}",
+    "reference trust perhaps": "reference: {view: v00, image: images/v00.png, trust: perhaps}",
     "reference depth missing": "reference: {view: v00, image: images/v00.png, depth: d.exr}",
     "reference depth a jpg": "reference: {view: v00, image: images/v00.png, depth: transforms.json}",
     "reference lists in lists": "reference: [[{view: v00, image: images/v00.png}]]",
@@ -886,7 +886,7 @@ def test_names_that_look_like_numbers_or_dates_are_names(good_captures, tmp_path
         replace_in_file("transforms.json", f"images/{old}.png", f"images/{new}.png")(folder)
     shutil.copy(folder / "images/20220819_104425.png", folder / "12.png")
     write_yaml(
-        "test: [2022-08-19, 007]\nclean: [on]\nreference: {view: 20220819_104425, image: 12.png, undistorted: off}\n"
+        "test: [2022-08-19, 007]\nclean: [on]\nreference: {view: 20220819_104425, image: 12.png, trust: off}\n"
         "budget: 90\nregion: {center: [0, 1, 0.5], size: [1, 2, 3]}\nstages: {fit: {iterations: 20}}"
     )(folder)
     assert first_message(folder, out) is None

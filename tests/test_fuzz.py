@@ -146,7 +146,7 @@ SCENE = b"""layout: transforms
 train: [v1, 20220819_104425, 2022-08-19]
 test: every 8
 reference:
-  - {view: v1, image: "r.png", undistorted: off}
+  - {view: v1, image: "r.png", trust: off}
   - &other {view: 'v2', image: r2.png, depth: ~}
 region: {center: [0, .5, -1e3], size: [1, 1, 1]}
 profile: laptop

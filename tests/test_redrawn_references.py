@@ -14,9 +14,10 @@ from scenes.images import natural_noise, paint_red, psnr, rectangle_mask
 from scenes.references import reference_entry, run_reference_stage
 
 from lab.studies import redrawn
+from reffusion.capture.lens import to_directions, to_pixels, undistort_image, undistorted_pinhole
+from reffusion.capture.lenses import load_lenses
 from reffusion.capture.views import load_placed_views
 from reffusion.io.arrays import load_json, save_json
-from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.params.reference import ReferenceSpec
 from reffusion.references import changes, color, registration
@@ -144,15 +145,22 @@ def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall_folders, t
         run_reference_stage(wall_folders, tmp_path / "other", **reference_entry("a2"))
 
 
-def test_a_picture_of_the_undistorted_view_asks_for_its_key(wall_folders, tmp_path):
+@pytest.mark.parametrize("painted", [False, True])
+def test_a_picture_may_be_made_over_the_photograph_or_over_the_undistorted_one(wall_folders, tmp_path, painted):
     file = wall_folders["poses"] / "lenses.json"
     record = load_json(file)
     record["views"]["a2"]["radial"] = [-0.25]
     save_json(file, record)
-    save_image(wall_folders["scene"] / "ref.png", wall_scene.photo(wall_scene.CAMERAS["a2"]))
-    with pytest.raises(BadInput, match=r"ref\.png: fits the undistorted picture.*write `undistorted: true` beside it"):
-        run_reference_stage(wall_folders, tmp_path / "refused", **reference_entry("a2"))
-    assert "a2" in run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2", undistorted=True))
+    lens, truth = load_lenses(wall_folders["poses"])[0]["a2"], wall_scene.photo(wall_scene.CAMERAS["a2"])
+    pixels = np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), -1)
+    photograph = undistort_image(truth, to_pixels(to_directions(pixels, lens), undistorted_pinhole(lens)))
+    path = wall_folders["scene"] / ("painted/a2.png" if painted else "ref.png")
+    entry = {} if painted else reference_entry("a2")
+    hole = wall_scene.true_unobserved(wall_scene.CAMERAS["a2"], 1.6)
+    for name, picture in (("straight", truth), ("photograph", photograph)):
+        save_image(path, picture)
+        found = run_reference_stage(wall_folders, tmp_path / name, **entry)["a2"]
+        assert psnr(found.image, truth, hole) > 30, name
 
 
 def test_a_person_overrules_a_refusal(wall_folders, tmp_path):

@@ -16,7 +16,6 @@ class ReferenceSpec(Settings):
     view: str = Field(description="name of the view it completes")
     image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
-    undistorted: bool = Field(False, description="painted over the undistorted image of `poses`, not over the photo")
     trust: bool = Field(False, description="use it even though it does not seem to show its view")
     _slashes = field_validator("image", "depth")(to_slashes)
 

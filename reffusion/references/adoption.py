@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from reffusion.capture.lens import Lens, undistorted_pinhole
 from reffusion.capture.lenses import load_lenses
 from reffusion.fit import exposure
 from reffusion.io.files import BadInput
@@ -94,15 +95,7 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     keeps_exposure = not file.painted and has_photograph(space.poses, file.view)
     photo = load_photo(space, file.view) if keeps_exposure else space.load_photos([file.view])[file.view]
     hidden = object_pixels(masks)
-    image, inside = undistort_reference(file, lens, photo)
-    found = registration.register(image, photo, hidden)
-    if not found.fits and not file.undistorted:
-        straight, _ = undistort_reference(replace(file, undistorted=True), lens, photo)
-        if registration.register(straight, photo, hidden).fits:
-            raise BadInput(
-                f"{file.path}: fits the undistorted picture of its view '{file.view}', not the photograph; write "
-                "`undistorted: true` beside it in scene.yaml"
-            )
+    lens, image, inside, found = find_lens(file, lens, photo, hidden)
     if not found.is_identical:
         found = check_match(file, found, image, space)
     print(f"reference {file.view}: {found}", flush=True)
@@ -126,6 +119,33 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalized frame
         depth = depth * space.scene.similarity.scale
     return Reference(camera, image, masks.invent & inside & differs, depth), str(found)
+
+
+def find_lens(
+    file: ReferenceFile, lens: Lens, photo: np.ndarray, hidden: np.ndarray
+) -> tuple[Lens, np.ndarray, np.ndarray, Registration]:
+    """Find out whether a picture was made over the photograph of its view or over the undistorted photograph.
+
+    Args:
+        file: the reference's files.
+        lens: the lens of the photograph.
+        photo: uint8 [H, W, 3], the undistorted photograph.
+        hidden: bool [H, W], the object's pixels.
+
+    Returns:
+        The lens of the picture; both results of `undistort_reference` for it; and its registration, which is the
+        better one. If both are equally good, paintings count as made over the undistorted photograph, other pictures
+        as made over the photograph.
+    """
+    pinhole = undistorted_pinhole(lens)
+    lenses = [lens] if pinhole == lens.pinhole else [pinhole, lens] if file.painted else [lens, pinhole]
+    found = []
+    for each in lenses:
+        image, inside = undistort_reference(file, each, photo)
+        found.append((each, image, inside, registration.register(image, photo, hidden)))
+        if found[-1][-1].is_identical:
+            return found[-1]
+    return max(found, key=lambda each: float(np.nan_to_num(each[-1].inlier_ratio)))
 
 
 def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, space: Workspace) -> Registration:

@@ -31,16 +31,15 @@ class ReferenceFile:
         path: file of the picture. Its size may differ from the photograph's, and its proportions slightly; both are
             corrected later.
         depth: file of a depth or disparity map of the whole picture; None if there is none.
-        undistorted: True if the picture was painted over an undistorted image, False if over the photograph.
         painted: True if the picture lies in the folder `painted`. It was then painted over an image that the stage
-            `reference` wrote for this purpose, and has the common exposure of the scene.
+            `reference` wrote for this purpose, undistorted and in the common exposure of the scene, or over the
+            photograph.
         trust: True to use the picture even if it does not seem to show its view.
     """
 
     view: str
     path: Path
     depth: Path | None = None
-    undistorted: bool = False
     painted: bool = False
     trust: bool = False
 
@@ -117,7 +116,7 @@ def load_reference_files(
         if name in found:
             raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
-        found[name] = ReferenceFile(name, path, depth, each.undistorted, trust=each.trust)
+        found[name] = ReferenceFile(name, path, depth, trust=each.trust)
     for file in _paintings(list_paintings(folder), views):
         named = found.get(file.view)
         found[file.view] = replace(file, trust=named is not None and named.trust and named.path == file.path)
