@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from reffusion.depth.multiview_depth import estimate_multiview_depth
 from reffusion.depth.sparse_to_dense import NORMAL_NEIGHBORS, SparsePoints
-from reffusion.gaussians.sheets import Sheets, sheet_gaussians
+from reffusion.gaussians.sheets import sheet_gaussians
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -74,7 +74,7 @@ def gaussians_on_surfaces(
             rendering = rasterizer.render(result, camera, sh_degree=0)
             rendered_depth, is_covered = rendering.depth.cpu().numpy(), rendering.alpha.cpu().numpy() >= MIN_ALPHA
             missing &= ~(is_covered & (rendered_depth < OCCLUSION_RATIO * depth))
-        added = sheet_gaussians(images[camera.name], depth, missing, camera, (params.sh.degree + 1) ** 2, Sheets())
+        added = sheet_gaussians(images[camera.name], depth, missing, camera, (params.sh.degree + 1) ** 2)
         added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
         result = added if result is None else result.zip_map(added, lambda a, b: torch.cat([a, b]))
     return result

@@ -10,6 +10,8 @@ from reffusion.geometry import pixel_rays, unproject
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
+THICKNESS = 0.1  # standard deviation along the normal, divided by the smaller of the two within the surface
+GRAZING = 0.15  # cosine of the angle between normal and viewing direction below which disks are not stretched further
 STEP = 0.02  # change of the disparity's slope per pixel, relative to the disparity, above which a pixel lies at a step
 
 
@@ -21,8 +23,6 @@ def surface_gaussians(
     *,
     sh_count: int,
     spread: float = 0.5,
-    thickness: float = 0.1,
-    grazing: float = 0.15,
     opacity: float = 0.95,
     offset_px: float = 0.0,
 ) -> Gaussians:
@@ -41,8 +41,6 @@ def surface_gaussians(
         camera: the view.
         sh_count: number of spherical harmonics per Gaussian; all but the constant one are 0.
         spread: standard deviation of a disk in pixels of the view.
-        thickness: standard deviation along the normal, divided by the smaller of the two within the surface.
-        grazing: cosine of the angle between normal and viewing direction below which disks are not stretched further.
         opacity: opacity of each disk, in (0, 1).
         offset_px: distance of the disks behind the surface, along its normal, in pixels.
 
@@ -58,10 +56,10 @@ def surface_gaussians(
     points, normals = points[pixels], normals[pixels]
     rays = points - camera.center
     view_directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    cosine = np.clip(-(view_directions * normals).sum(-1), grazing, 1.0)
+    cosine = np.clip(-(view_directions * normals).sum(-1), GRAZING, 1.0)
     axes = _axes(normals, view_directions, camera)
     tangent_scale = spread * depth[pixels] / np.sqrt(camera.fx * camera.fy)
-    scales = np.stack([tangent_scale, tangent_scale / cosine, thickness * tangent_scale], -1)
+    scales = np.stack([tangent_scale, tangent_scale / cosine, THICKNESS * tangent_scale], -1)
     points = points - offset_px / spread * tangent_scale[:, None] * normals
     colors = (image[pixels] / 255.0 if image.dtype == np.uint8 else image[pixels]).astype(np.float64)
     sh = np.zeros((len(points), sh_count, 3))

@@ -19,7 +19,6 @@ from reffusion.background.mirrors import render_mirrors
 from reffusion.background.model import Background
 from reffusion.background.visibility import OPAQUE, DepthView, opaque_depth
 from reffusion.kernels.compiled import map_in_threads, views_at_once
-from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 
@@ -105,22 +104,6 @@ def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.n
     # added this surface, and the pixel is unobserved: no photograph shows its background.
     in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
     return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
-
-
-def find_floaters(
-    gaussians: Gaussians, is_new: Tensor, background: Background, uncovered: Mapping[str, np.ndarray], tau: float
-) -> Tensor:
-    """Return bool [N], the floaters: remaining Gaussians that are visible mostly in uncovered pixels.
-
-    Args:
-        gaussians: the N Gaussians of the draft.
-        is_new: bool [N], True for the Gaussians that references added; these are never floaters.
-        background: the photographs and surfaces around the object.
-        uncovered: view name -> bool [H, W], the result of `find_uncovered`.
-        tau: a Gaussian is a floater if its blending weights in uncovered pixels, summed over the views in `uncovered`,
-            exceed `tau` times those in all other pixels of these views.
-    """
-    return voting.find_floaters(gaussians, background.cameras, uncovered, tau) & ~is_new
 
 
 @torch.no_grad()

@@ -40,11 +40,7 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of its files.
-
-    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
-    parameters name an inpainter that has no file of its own, such as the diffusion prior.
-    """
+    """Return the facts of `painters.reference_facts`."""
     return painters.reference_facts(params.inpainter)
 
 
