@@ -132,7 +132,7 @@ def test_scores_at_the_start_are_of_one_size_whatever_the_width():
 
 def test_minibatch_deviation_against_numpy():
     features = random_normal(12, 5, 3, 3)
-    out = append_minibatch_std(features, group=4)
+    out = append_minibatch_std(features)
     assert (out[:, :5] == features).all() and out.shape == (12, 6, 3, 3)
     for i in range(12):
         members = features.numpy()[i % 3 :: 3]  # patch i belongs to one of three groups of four

@@ -225,7 +225,7 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
 
 def test_densification_needs_large_gradients_and_is_bounded(prior, text, tmp_path, monkeypatch):
-    monkeypatch.setattr(densification, "PRUNE_OPA", 0.0)
+    monkeypatch.setattr(densification, "PRUNED_OPACITY", 0.0)
     monkeypatch.setattr(D, "DENSIFIED_UNTIL", 1.0)
     masked = int(random_wall()[1].sum())
 

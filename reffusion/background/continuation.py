@@ -45,9 +45,7 @@ ENCLOSED = 0.8  # a free patch is enclosed if a larger share of its border is se
 TOUCHING = 0.25  # a plane continues into an unknown patch only if a larger share of the patch's border is seen
 
 
-def find_planes(
-    center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray, seed: int = 0
-) -> list[Plane]:
+def find_planes(center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray) -> list[Plane]:
     """Find the planes around the removed object, with the cells into which they continue.
 
     Planes are fitted by RANSAC to samples, i.e. points of the surfaces around the masks, taken from several views. One
@@ -60,18 +58,17 @@ def find_planes(
         radius: radius around the center that contains most of the removed object.
         views: depth of the training views, rendered with the object.
         points: [P, 3], the scene's sparse points; P = 0 is allowed.
-        seed: seed of the random draws.
 
     Returns:
         Up to `MAX_PLANES` planes in the order in which RANSAC found them, about by decreasing number of samples; then
         the third faces. The list is empty if there are too few samples.
     """
-    samples = sample_surfaces(center, REACH * radius, views, seed)
+    samples = sample_surfaces(center, REACH * radius, views)
     points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
     inlier, unexplained = INLIER * radius, np.ones(len(samples), bool)
     distance = float(np.median([np.linalg.norm(view.camera.center - center) for view in views])) if views else 0.0
     found: list[tuple[np.ndarray, float]] = []
-    generator = np.random.default_rng(seeding.seed_for(seed, "planes around"))
+    generator = np.random.default_rng(seeding.seed_for(0, "planes around"))
     least = max(MIN_SAMPLES, MIN_SHARE * len(samples))
     for normal, offset in search_planes(samples, inlier, generator, least, CLAIMED):
         refined = refine_by_points(normal, offset, points, inlier, MIN_SPREAD * radius)

@@ -92,14 +92,14 @@ def random_mask(samples: TrainingSamples, size: int, generator: torch.Generator)
     return rectangle_mask(size, generator)
 
 
-def crop_border(source: Picture, max_border: float, generator: torch.Generator) -> Picture:
+def crop_border(source: Picture, generator: torch.Generator) -> Picture:
     """Return the picture without a strip of random width at each side.
 
-    A strip takes at most the share `max_border` of the picture's height or width.
+    A strip takes at most the share `MAX_BORDER` of the picture's height or width.
     """
     height, width = source.region.shape
-    top, bottom = (int(_uniform(0, max_border, generator) * height) for _ in range(2))
-    left, right = (int(_uniform(0, max_border, generator) * width) for _ in range(2))
+    top, bottom = (int(_uniform(0, MAX_BORDER, generator) * height) for _ in range(2))
+    left, right = (int(_uniform(0, MAX_BORDER, generator) * width) for _ in range(2))
     rows, columns = slice(top, height - bottom), slice(left, width - right)
     return Picture(source.image[:, rows, columns], source.region[rows, columns])
 
@@ -141,7 +141,7 @@ def _sample_of_reference(
     if _uniform(0, 1, generator) < local_share:
         image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
     else:
-        whole = crop_border(source, MAX_BORDER, generator)
+        whole = crop_border(source, generator)
         image, hole = two_scales(whole.image, [], native)[0], two_scale_masks(whole.region, [], native)[0]
         prompt = GLOBAL
     if hole.shape[-2:] == (size, size):
