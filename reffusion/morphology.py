@@ -114,6 +114,11 @@ def _small_parts(mask: np.ndarray, diameter_px: float) -> np.ndarray:
     return small[parts]
 
 
+def touches_border(mask: np.ndarray) -> bool:
+    """Return whether a mask, bool [H, W], has a True pixel at the image's border."""
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+
+
 def convex_hull(mask: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the convex hull of the mask's pixels; empty if the mask is empty."""
     rows, columns = np.nonzero(mask)

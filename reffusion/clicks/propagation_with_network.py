@@ -16,7 +16,7 @@ votes contradict it.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -78,10 +78,6 @@ class Votes:
         """[N] in [0, 1], the share of each Gaussian's votes for the object; 0 for Gaussians without a label."""
         return np.where(self.has_label, self.counts[:, 0] / np.maximum(self.counts.sum(1), self.least), 0.0)
 
-    def plus(self, counts: np.ndarray) -> Votes:
-        """Return the sum of these votes and of `counts` [N, 2], the votes of a further view."""
-        return Votes(self.counts + counts, self.least)
-
 
 @dataclass(frozen=True)
 class Projection:
@@ -128,7 +124,8 @@ def propagate_masks(
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
-            votes = votes.plus(count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief)))
+            counts = count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief))
+            votes = replace(votes, counts=votes.counts + counts)
     votes, found = assume_supports(gaussians, votes), dict(masks)
     for name in order:
         projection = project_votes(gaussians, cameras[name], votes)

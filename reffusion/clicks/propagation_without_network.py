@@ -87,19 +87,13 @@ def label_gaussians(
         np.where(outside_mask, LARGEST_VOTE, np.minimum(outside, LARGEST_VOTE)),
     )
     others = {name: camera for name, camera in cameras.items() if name not in masks}
-    known = color_evidence.KnownLabels(
-        inside > np.maximum(LEAST_VOTE, outside), outside > np.maximum(LEAST_VOTE, inside)
-    )
-    side, labels = relative_distance(near.pairs, near.way, known.inside, known.outside), known.inside
+    is_object, is_other = inside > np.maximum(LEAST_VOTE, outside), outside > np.maximum(LEAST_VOTE, inside)
+    side, labels = relative_distance(near.pairs, near.way, is_object, is_other), is_object
     for _ in range(ROUNDS):
-        log_ratio, coverage = color_evidence.color_votes(
-            gaussians, color_evidence.KnownLabels(labels, known.outside), others, image_of
-        ).T
-        gain = (
-            np.minimum(COLOR * coverage, LARGEST_VOTE) * (log_ratio + NEARER * side) * ~(known.inside | known.outside)
-        )
+        log_ratio, coverage = color_evidence.color_votes(gaussians, labels, is_other, others, image_of).T
+        gain = np.minimum(COLOR * coverage, LARGEST_VOTE) * (log_ratio + NEARER * side) * ~(is_object | is_other)
         before, against, for_it = labels, outside + np.maximum(-gain, 0), inside + np.maximum(gain, 0)
-        labels = keep_connected(min_cut(against, for_it, near.pairs, near.likeness), near.pairs, known.inside)
+        labels = keep_connected(min_cut(against, for_it, near.pairs, near.likeness), near.pairs, is_object)
         if (labels == before).all():
             break
     return torch.as_tensor(labels, device=gaussians.means.device)

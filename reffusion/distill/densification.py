@@ -17,8 +17,8 @@ def densify_masked(
     """Clone or split the masked Gaussians with large screen-space gradients, then prune faint Gaussians.
 
     All Gaussians, masked or not, whose opacity is below `PRUNED_OPACITY` are pruned. Without masked Gaussians nothing
-    is done, not even pruning. Unmasked Gaussians are never cloned or split, because the optimizer accumulates screen-space
-    gradients of masked Gaussians only.
+    is done, not even pruning. Unmasked Gaussians are never cloned or split, because the optimizer accumulates
+    screen-space gradients of masked Gaussians only.
 
     Args:
         optimizer: Holds the Gaussians, which are replaced, and their accumulated screen-space gradients, which are

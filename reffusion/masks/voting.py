@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Rendering
 
@@ -181,11 +181,6 @@ def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | N
         The name; None if no view has pixels to invent.
     """
     sizes = {name: int(invent[name].sum()) for name in names if invent[name].any()}
-    whole = {name: size for name, size in sizes.items() if not _touches_border(invent[name])}
+    whole = {name: size for name, size in sizes.items() if not morphology.touches_border(invent[name])}
     candidates = whole or sizes
     return max(sorted(candidates), key=candidates.__getitem__) if candidates else None
-
-
-def _touches_border(mask: np.ndarray) -> bool:
-    """Return whether a mask, bool [H, W], has a True pixel at the image's border."""
-    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())

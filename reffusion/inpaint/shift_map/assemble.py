@@ -12,15 +12,19 @@ in which candidates are compared with the known picture.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from scipy import ndimage
 
+from reffusion.graph_cut import neighbor_pairs
 from reffusion.inpaint.poisson import blend
-from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features, neighbor_pairs
+from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features
 from reffusion.inpaint.source_image import SourceImage
+
+if TYPE_CHECKING:
+    from reffusion.inpaint.shift_map.plane_motions import PlaneMotions
 
 RING = 6  # px, width of the ring
 MAX_PIXELS = 15000  # pixels of the graph cut: in a larger hole only every second, third, ... row and column takes part
@@ -80,18 +84,6 @@ class Samples:
     colors: np.ndarray
     detail: np.ndarray
     valid: np.ndarray
-
-
-class Candidates(Protocol):
-    """Photographs laid over the hole, one for each of K motions; candidate k is the k-th of them."""
-
-    def __len__(self) -> int: ...
-
-    def sample(self, k: int, pixels: HolePixels) -> Samples:
-        """Return the appearance of candidate k at the pixels."""
-
-    def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
-        """Return [N], the cost of each pixel if candidate k fills it; `INVALID_COST` where it must not."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +148,7 @@ def assemble(
     target: SourceImage,
     hole: np.ndarray,
     pixels: HolePixels,
-    candidates: Candidates,
+    candidates: PlaneMotions,
     region: np.ndarray,
 ) -> Assembly:
     """Fill the hole of the target from the candidates.
@@ -177,7 +169,7 @@ def assemble(
     return Assembly(*_blend(target, hole, pixels, labels, candidates, region))
 
 
-def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int) -> np.ndarray:
+def _choose(pixels: HolePixels, candidates: PlaneMotions, shape: tuple[int, int], stride: int) -> np.ndarray:
     """Return each pixel's candidate, chosen by a graph cut."""
     grid = pixels.rows, pixels.columns
     costs, looks = [], []
@@ -189,7 +181,10 @@ def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], 
     known = features(*grid, pixels.colors, pixels.detail, shape, stride)
     off = np.minimum(feature_distance(look, known), 2 * MAX_DIFFERENCE)
     cost += np.where(pixels.in_hole | (cost >= INVALID_COST), 0, off)
-    return choose_candidates(cost, look, neighbor_pairs(*grid, shape, stride))
+    index = np.full(shape, -1)
+    index[grid] = np.arange(len(pixels))
+    pairs, _ = neighbor_pairs(index, ((0, stride), (stride, 0)))
+    return choose_candidates(cost, look, pairs)
 
 
 def _blend(
@@ -197,7 +192,7 @@ def _blend(
     hole: np.ndarray,
     pixels: HolePixels,
     labels: np.ndarray,
-    candidates: Candidates,
+    candidates: PlaneMotions,
     region: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the picture with the chosen pieces blended by their gradients, and the pixels that were filled."""
