@@ -315,14 +315,6 @@ def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(t
         assert (moved & masked).any() == (reaches == "shown")
 
 
-def test_the_critic_waits_for_its_part_of_the_run(tmp_path):
-    run_distill(
-        tmp_path / "late", None, None, with_changes(SETTINGS, sds=OFF, iterations=8, adversarial={"start": 0.5})
-    )
-    judged = {r["iteration"]: "critic_loss" in r for r in read_trace(tmp_path / "late" / "trace.jsonl")}
-    assert judged == {step: step > 4 for step in judged} and len(set(judged.values())) == 2
-
-
 def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
     start, masked = random_wall()
     alone = {"sds": OFF, "reference": {"weight": 1.0}, "reconstruction": {"every": 0}}

@@ -60,7 +60,6 @@ FIXED = {
     "personalize.optimizer.lr_unet": 2e-4,
     "personalize.optimizer.lr_text": 4e-5,
     "personalize.samples.size": 0,
-    "personalize.samples.masks": "rectangles",
     "initialize.start": "reference",
     "distill.prior": SD2,
     "distill.sds.weight": 1e-3,

@@ -173,15 +173,8 @@ def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
     Args:
         fake: Scores of fake patches, of any shape.
         form: One of the two forms.
-
-    Raises:
-        ValueError: `form` is unknown.
     """
-    if form == "saturating":
-        return F.logsigmoid(-fake).mean()
-    if form == "non-saturating":
-        return -F.logsigmoid(fake).mean()
-    raise ValueError(f"the generator's loss must be saturating or non-saturating, got {form!r}")
+    return F.logsigmoid(-fake).mean() if form == "saturating" else -F.logsigmoid(fake).mean()
 
 
 def gradient_penalty(scores: Tensor, patches: Tensor) -> Tensor:
