@@ -160,9 +160,7 @@ def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarra
 
 def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
     """Return the convex hull [CELLS, CELLS] of a plane's large seen patches, the region in which it may continue."""
-    patches, count = ndimage.label(_without_rims(seen))
-    areas = np.bincount(patches.ravel(), minlength=count + 1)
-    areas[0] = 0
+    patches, areas = morphology.label_sizes(_without_rims(seen))
     large = (areas >= MIN_PATCH * max(areas.max(), 1))[patches]
     standing = plane.cell_centers[large]
     # The surface may stand on `grounds`, planes that cross it and have more samples. Seen cells are projected down onto
@@ -211,8 +209,8 @@ def _map_plane(
 def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
     """Return bool [CELLS, CELLS], the patches of fewer than `min_cells` free cells; none at the map's border."""
     # Depth errors beside the object's edge make small patches. A patch at the map's border may continue beyond the map.
-    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # joins all patches at the map's border
-    areas = np.bincount(patches.ravel(), minlength=count + 1)
+    # the padding joins all patches at the map's border
+    patches, areas = morphology.label_sizes(np.pad(free, 1, constant_values=True))
     return free & (areas < min_cells)[patches][1:-1, 1:-1]
 
 

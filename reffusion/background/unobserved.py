@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
@@ -136,7 +135,7 @@ def _continues_surroundings(
     if not patch.any():
         return False
     radius = max(3, round(RING * patch.shape[1]))
-    ring = cv2.dilate(patch.astype(np.uint8), morphology.square(radius)) > 0
+    ring = morphology.dilate_square(patch, radius)
     ring &= known & np.isfinite(plane_depth)
     # pixels at which views see through the plane are ignored
     ring &= ~plane.pixels_on(plane.free, plane_depth, camera, ring)

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from reffusion.clicks.marks import Clicks, mark_pixels
 from reffusion.graph_cut import neighbor_pairs
+from reffusion.io.images import fitting_size
 
 LONGEST = 192  # px, the larger side of the picture that is segmented
 # Slope of the relief (`ViewEvidence.relief`) in px per px: the largest within a surface, and the smallest of a certain
@@ -21,8 +22,7 @@ def downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int,
     Returns:
         Colors float64 [h * w, 3] in 8-bit L*a*b*; (h, w); marks int8 [h, w], OBJECT, OTHER or UNKNOWN.
     """
-    factor = min(1.0, LONGEST / max(image.shape[:2]))
-    height, width = (max(1, round(side * factor)) for side in image.shape[:2])
+    width, height = fitting_size(image.shape[1], image.shape[0], LONGEST)
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).reshape(-1, 3).astype(np.float64)
     at = Clicks(clicks.points * (width / image.shape[1], height / image.shape[0]), clicks.positive)

@@ -258,8 +258,7 @@ def _complete_gaps(
     """Return disparity [H, W] in which each gap of the hole continues the farthest of the surfaces that it touches."""
     result, continued = view.disparity.copy(), {}
     gaps, count = ndimage.label(view.hole, np.ones((3, 3)))
-    nearest = ndimage.distance_transform_edt(~view.hole, return_distances=False, return_indices=True)
-    nearest_gap = gaps[tuple(nearest)]
+    nearest_gap = gaps[morphology.nearest_known(view.hole)]
     for gap in range(1, count + 1):
         # `usable` pixels have a known or an anchored disparity.
         border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(gaps == gap, GAP_RING)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.depth.completion import unit_range
 from reffusion.graph_cut import HARD, alpha_expansion, neighbor_pairs, potts_cost
 
@@ -93,13 +93,11 @@ def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarra
     # unknown pixels). It arises where a pattern in the hole has the colors of another surface.
     island = np.zeros_like(missing)
     for surface in range(1, int(surfaces.max()) + 1):
-        component, _ = ndimage.label(labels == surface, np.ones((3, 3)))
-        is_connected = np.isin(component, np.unique(component[surfaces == surface]))
-        island |= (component > 0) & ~is_connected & missing
+        found = labels == surface
+        island |= found & ~ndimage.binary_propagation(found & (surfaces == surface), np.ones((3, 3)), found) & missing
     if not island.any() or island.all():
         return labels
-    nearest = ndimage.distance_transform_edt(island | (labels == 0), return_distances=False, return_indices=True)
-    return np.where(island, labels[tuple(nearest)], labels)
+    return np.where(island, labels[morphology.nearest_known(~island & (labels != 0))], labels)
 
 
 def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -104,6 +105,15 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 0, -normal / np.where(length > 0, length, 1.0), (0.0, 0.0, -1.0))
     return normal @ camera.world_to_camera[:3, :3]
+
+
+def is_beside_nearer(depth: np.ndarray, ratio: float) -> np.ndarray:
+    """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
+
+    The color of the nearer surface bleeds into these pixels. Their depth exceeds `ratio` times the smallest depth among
+    the 3 x 3 pixels around them.
+    """
+    return depth > ratio * cv2.erode(depth, np.ones((3, 3)))
 
 
 def one_sided_slope(values: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import torch
 
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
+from reffusion.background.visibility import OPAQUE
 from reffusion.depth import billboard, monocular
 from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.discontinuities import beside_steps, sharpen_steps
@@ -25,7 +26,6 @@ from reffusion.trace import Trace
 from reffusion.types import Camera, Reference, Rendering
 
 STEPS_MARGIN = 0.006  # of the image's width: how far beyond the hole ramps of the depth are sharpened to steps
-COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
 GAP_ALPHA = 0.5  # the new surface has a gap where another view renders a lower alpha in its C
 COMPLETION = CompletionSettings()
 
@@ -114,7 +114,7 @@ def fill_reference(
         ValueError: as `unprojection.estimate_depth`.
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
-    hole = unprojection.find_hole(draft, reference, mask, COVERED)
+    hole = unprojection.find_hole(draft, reference, mask, OPAQUE)
     if farthest and background.mirrors:
         hole |= reference.mask  # also where the visible surface lies behind a mirror image
     surface = estimate_surface(params, draft, reference, background, hole, disparity, log, farthest)

@@ -24,6 +24,7 @@ from reffusion.background.visibility import OPAQUE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
 from reffusion.inpaint.source_image import flat_source
 from reffusion.kernels.compiled import map_in_threads
+from reffusion.morphology import label_sizes, nearest_known
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
@@ -243,11 +244,10 @@ def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View
 def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
     """Return the map with the cells into which the plane may go on, up to `reach` from where the capture ends it."""
     seen, outside = plane_map.seen, ~plane_map.in_frame
-    parts, count = ndimage.label(seen)
-    if not count:
+    if not seen.any():
         return plane_map
-    sizes = np.bincount(parts.ravel())[1:]
-    large = np.isin(parts, 1 + np.flatnonzero(sizes >= MAIN * sizes.max()))
+    parts, sizes = label_sizes(seen)
+    large = seen & (sizes >= MAIN * sizes.max())[parts]
     # the capture ends the plane where seen cells meet cells outside all frames
     border = ndimage.binary_dilation(large, iterations=CONTACT) & outside
     areas, area_count = ndimage.label(outside)
@@ -265,14 +265,13 @@ def _visible_target(plane_map: _PlaneMap, others: Sequence[_PlaneMap], viewpoint
     target = plane_map.target.copy()
     for other in others:
         target &= ~other.occludes(plane_map.centers, viewpoint)
-    patches, _ = ndimage.label(target | plane_map.seen)
-    return target & np.isin(patches, np.unique(patches[plane_map.seen]))
+    return target & ndimage.binary_propagation(plane_map.seen, mask=target | plane_map.seen)
 
 
 def _paint(plane_map: _PlaneMap, target: np.ndarray) -> np.ndarray:
     """Return [n, 3] in [0, 1], the colors of the n target cells, made of patches of the seen cells."""
-    nearest = ndimage.distance_transform_edt(~plane_map.seen, return_distances=False, return_indices=True)
-    image = (255 * plane_map.color[tuple(nearest)]).round().astype(np.uint8)  # the cells around must not be black
+    # the cells around must not be black
+    image = (255 * plane_map.color[nearest_known(plane_map.seen)]).round().astype(np.uint8)
     source = flat_source(image, ~plane_map.seen)
     return complete(source, target, [source], seed=0).image[target] / 255
 

@@ -29,7 +29,6 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labeled by its position
-ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are removed, smaller holes filled
 
 
 def label_object(
@@ -106,8 +105,8 @@ def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:
 
     If `params.tidy` is False, the mask is returned unchanged.
     """
-    width = mask.shape[1]
-    return morphology.remove_small_parts(mask, ISLAND * width, GAP * width) if params.tidy else mask
+    island, gap = morphology.ISLAND * mask.shape[1], morphology.GAP * mask.shape[1]
+    return morphology.remove_small_parts(mask, island, gap) if params.tidy else mask
 
 
 def needs_unobserved(params: Params, fill: FillRequest) -> bool:

@@ -131,9 +131,7 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
     for name, hole in view_holes.items():
         uv, z = geometry.project(everything, hole.camera)
         # A view covers a pixel of another view if its own hole, at the reduced size, shows the same surface point.
-        inside, framed = geometry.sample_nearest(hole.pixels, uv)
-        depth, _ = geometry.sample_nearest(hole.depth, uv)
-        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < geometry.SAME_IF_COARSE * depth)
+        covers[name] = geometry.shows_points(np.where(hole.pixels, hole.depth, 0), uv, z, geometry.SAME_IF_COARSE)
     return covers, len(everything)
 
 

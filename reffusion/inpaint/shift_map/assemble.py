@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -22,6 +21,7 @@ from reffusion.graph_cut import neighbor_pairs
 from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features
 from reffusion.inpaint.source_image import SourceImage
+from reffusion.morphology import masked_blur, nearest_known
 
 if TYPE_CHECKING:
     from reffusion.inpaint.shift_map.plane_motions import PlaneMotions
@@ -109,9 +109,8 @@ def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.
         image: uint8 [H, W, 3].
         masked: bool [H, W], pixels that do not count in the mean.
     """
-    known, colors = (~masked).astype(np.float32)[..., None], image.astype(np.float32)
-    blur = lambda a: cv2.GaussianBlur(a, (0, 0), DETAIL_SIGMA * image.shape[1]).reshape(*a.shape[:2], -1)
-    return colors, colors - blur(colors * known) / np.maximum(blur(known), 1e-3)
+    colors = image.astype(np.float32)
+    return colors, colors - masked_blur(colors, ~masked, DETAIL_SIGMA * image.shape[1])
 
 
 def erode_readable(source: SourceImage, masked: np.ndarray) -> np.ndarray:
@@ -164,8 +163,7 @@ def assemble(
     labels = _choose(coarse, candidates, hole.shape, stride)
     grid = np.full(hole.shape, -1)
     grid[coarse.rows, coarse.columns] = labels
-    nearest = ndimage.distance_transform_edt(grid < 0, return_distances=False, return_indices=True)
-    labels = grid[tuple(nearest[:, pixels.rows, pixels.columns])]
+    labels = grid[nearest_known(grid >= 0)][pixels.rows, pixels.columns]
     return Assembly(*_blend(target, hole, pixels, labels, candidates, region))
 
 
