@@ -149,7 +149,8 @@ def masked_blur(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarr
     Args:
         sigma: standard deviation of the Gaussian in px.
     """
-    weight, blur = known.astype(np.float32), lambda each: cv2.GaussianBlur(each, (0, 0), sigma)
+    weight = known.astype(np.float32)
+    blur = lambda each: cv2.GaussianBlur(each, (0, 0), sigma)
     return blur(values * weight[..., None]) / np.maximum(blur(weight), 1e-3)[..., None]
 
 

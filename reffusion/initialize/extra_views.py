@@ -33,10 +33,9 @@ def complete_extra_views(
 ) -> tuple[Draft, list[Reference], dict[str, np.ndarray]]:
     """Complete the view with most uncovered pixels, add it to the draft, and repeat, up to `params.extra_views` times.
 
-    Before the first view, floaters are removed: remaining Gaussians that are visible mostly in uncovered
-    pixels. The loop ends early if no view has enough
-    uncovered pixels (`coverage.least_covered_view`). A view whose depth cannot be estimated is left as it is. A line is
-    printed for each view.
+    Before the first view, floaters are removed: remaining Gaussians that are visible mostly in uncovered pixels. The
+    loop ends early if no view has enough uncovered pixels (`coverage.least_covered_view`). A view whose depth cannot be
+    estimated is left as it is. A line is printed for each view.
 
     Args:
         params: parameters of the stage `initialize`.
