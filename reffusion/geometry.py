@@ -114,6 +114,19 @@ def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.nd
     return image[row, column], inside
 
 
+def shows_points(depth: np.ndarray, uv: np.ndarray, z: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return bool [...], at which of the points of `project` a depth map shows a surface.
+
+    Args:
+        depth: [H, W], camera z, 0 where unknown.
+        uv: [..., 2], pixel coordinates.
+        z: [...], camera depth.
+        tolerance: relative difference of depth below which the surface is at the point.
+    """
+    shown, inside = sample_nearest(depth, uv)
+    return inside & (shown > 0) & (np.abs(z - shown) < tolerance * shown)
+
+
 def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Camera]) -> float:
     """Return the smallest of the angles at a point between the direction to `camera` and those to the other cameras.
 

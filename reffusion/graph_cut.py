@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
 UNIT = 1000  # integer capacity that stands for a cost of 1: the solver of the cut takes integers only
+NEIGHBORS = ((0, 1), (1, 0), (1, 1), (1, -1))  # offsets to the 8 neighbors, one of each opposite two
 HARD = 1e4  # cost that forbids a label, because no sum of the costs of pairs exceeds it
+
+
+def neighbor_pairs(index: np.ndarray, offsets: Sequence[tuple[int, int]] = NEIGHBORS) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs int [E, 2] of neighboring pixels, and their distances [E] in pixels.
+
+    Args:
+        index: int [H, W], the numbers of the pixels; those with the number -1 take no part.
+        offsets: (row >= 0, column) of the second pixel of a pair relative to the first one.
+    """
+    pairs, length = [], []
+    for down, right in offsets:
+        height, width = max(0, index.shape[0] - down), max(0, index.shape[1] - abs(right))
+        first = index[:height, max(0, -right) :][:, :width]
+        second = index[down:, max(0, right) :][:, :width]
+        both = np.stack([first.ravel(), second.ravel()], 1)
+        both = both[(both >= 0).all(1)]
+        pairs.append(both)
+        length.append(np.full(len(both), np.hypot(down, right)))
+    return np.concatenate(pairs), np.concatenate(length)
 
 
 def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+ISLAND, GAP = 0.01, 0.02  # of the image's width: usual sizes below which islands are removed, and holes filled
+
 
 def to_pixels(fraction: float, width: int) -> int:
     """Convert a fraction of the image's width to pixels, rounded, at least 1."""
@@ -35,6 +37,11 @@ def dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
     if not fraction:
         return mask
     return cv2.dilate(mask.astype(np.uint8), disk(to_pixels(fraction, mask.shape[1]))) > 0
+
+
+def dilate_square(mask: np.ndarray, radius: int) -> np.ndarray:
+    """Dilate a mask, bool [H, W], by a square; the radius is in px."""
+    return cv2.dilate(mask.astype(np.uint8), square(radius)) > 0
 
 
 def dilate_by_distance(mask: np.ndarray, fraction: float) -> np.ndarray:
@@ -107,11 +114,49 @@ def remove_small_parts(mask: np.ndarray, island_px: float, gap_px: float) -> np.
 
 def _small_parts(mask: np.ndarray, diameter_px: float) -> np.ndarray:
     """Return bool [H, W], the connected parts of the mask with a smaller area than a disk of this diameter."""
-    parts, count = ndimage.label(mask)
-    area = np.bincount(parts.ravel(), minlength=count + 1)
-    small = area < np.pi / 4 * diameter_px**2
-    small[0] = False
-    return small[parts]
+    parts, sizes = label_sizes(mask)
+    return mask & (sizes < np.pi / 4 * diameter_px**2)[parts]
+
+
+def label_sizes(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the connected parts of a mask, bool [H, W], as labels 1, 2, ..., and the number of pixels of each label.
+
+    Args:
+        structure: bool [3, 3], which of the pixels around a pixel are connected with it; None for horizontal and
+            vertical neighbors.
+
+    Returns:
+        int [H, W], the labels, 0 outside the mask; and int [K + 1], the sizes. The size of the label 0 is 0.
+    """
+    parts, _ = ndimage.label(mask, structure)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return parts, sizes
+
+
+def nearest_known(known: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return row and column of the True pixel that is nearest to each pixel, int [H, W] both, as an index.
+
+    Args:
+        known: bool [H, W], with at least one True pixel.
+    """
+    return tuple(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+
+
+def masked_blur(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
+    """Return values, float32 [H, W, C], blurred by a Gaussian over the pixels `known`, bool [H, W], alone.
+
+    Args:
+        sigma: standard deviation of the Gaussian in px.
+    """
+    weight = known.astype(np.float32)
+    blur = lambda each: cv2.GaussianBlur(each, (0, 0), sigma)
+    return blur(values * weight[..., None]) / np.maximum(blur(weight), 1e-3)[..., None]
+
+
+def touches_border(mask: np.ndarray) -> bool:
+    """Return whether a mask, bool [H, W], has a True pixel at the image's border."""
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def convex_hull(mask: np.ndarray) -> np.ndarray:

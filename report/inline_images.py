@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from reffusion.io.images import resize_image
+from reffusion.io.images import fitting_size, resize_image
 
 QUALITY = 70  # WebP quality
 BYTES_PER_PIXEL = 0.2  # approximate size of a photograph at that quality
@@ -22,8 +22,7 @@ def photo_address(array: np.ndarray, longest: int) -> str:
 
     A picture whose longer side exceeds `longest` px is reduced to this size; no picture is enlarged.
     """
-    factor = min(1.0, longest / max(array.shape[:2]))
-    small = resize_image(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
+    small = resize_image(array, fitting_size(array.shape[1], array.shape[0], longest))
     return _address(Image.fromarray(small), "webp", quality=QUALITY)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from reffusion.io.arrays import load_json, load_labels, save_arrays, save_json, 
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import (
-    WARNINGS,
     list_objects,
     load_fill_masks,
     load_ignored,
@@ -27,6 +25,7 @@ from reffusion.io.scene import (
     load_scene,
     load_views,
     save_mask_sets,
+    save_warnings,
 )  # fmt: skip
 from reffusion.masks import consolidation, provided_gaussians, voting
 from reffusion.masks.classification import Classification, ObjectMarks, classify_scene
@@ -69,10 +68,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     load_photos = lambda: exposure.load_photos_in_scene_exposure(poses, fit, scene.train)
     found = classify_scene(params, scene, gaussians, marks, load_photos)
     messages = [*report_remnants(found.remnants, out, poses), *found.warnings]
-    for line in messages:
-        warnings.warn(line, stacklevel=1)
-    if messages:
-        save_json(out / WARNINGS, messages)
+    save_warnings(out, messages)
     save_labels(out / "debris.npy", found.debris.cpu())
     save_labels(out / "labels.npy", found.labels.cpu())
     save_arrays(out / SURFACES, collect_surfaces(found))

@@ -5,7 +5,6 @@ A role says whether a view is a training or a test view, clean (without the obje
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -37,7 +36,7 @@ from reffusion.capture.undistort import (
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import image_size
 from reffusion.io.ply import save_ply
-from reffusion.io.scene import WARNINGS, load_views, save_scene
+from reffusion.io.scene import load_views, save_scene, save_warnings
 from reffusion.io.splats import Splats
 from reffusion.params.poses import Params
 from reffusion.types import Scene
@@ -101,7 +100,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     load_one = lambda name: load_views(out, [name])[name]
-    _save_warnings(out, [*messages, *contradictions, *find_odd_photographs(normalized, load_one)])
+    save_warnings(out, [*messages, *contradictions, *find_odd_photographs(normalized, load_one)])
     normalized = complete_points(normalized, capture.poses, pinholes, partial(load_views, out))
     save_scene(out, normalized)
     if own_splats is not None:
@@ -128,18 +127,9 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
     """Write the stage's files, but no pictures, for a scene of Gaussians with a deleted object and no photographs."""
     placed, pinholes, messages = place_gaussians_only(params, scene, own_splats)
     save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
-    _save_warnings(out, messages)
+    save_warnings(out, messages)
     save_scene(out, placed)
     _save_own_splats(out, placed, own_splats)
-
-
-def _save_warnings(out: Path, messages: list[str]) -> None:
-    """Print warnings, and write them to warnings.json if there are any."""
-    for line in messages:
-        warnings.warn(line, stacklevel=1)
-    # `make check` reads this file. A run in which this stage is cached prints its warnings again.
-    if messages:
-        save_json(out / WARNINGS, messages)
 
 
 def _run_sfm(params: Params, out: Path, capture: Capture, roles: Roles) -> Capture:

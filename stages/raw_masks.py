@@ -5,7 +5,6 @@ This stage is separate from `poses`, so that new masks do not repeat structure f
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from reffusion.capture.views import check_outliers, resolve_view
 from reffusion.io.arrays import save_json
 from reffusion.io.given_masks import mask_file_size
 from reffusion.io.images import save_mask
-from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
+from reffusion.io.scene import load_raw_masks, load_scene, save_warnings
 from reffusion.masks import regions
 from reffusion.params.raw_masks import Params
 from reffusion.types import Scene
@@ -59,10 +58,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
     if params.region is not None:
         _save_region(params, out, placed)
     notes = (*notes, *find_odd_masks(placed, load_raw_masks(out, placed.train)))
-    for note in notes:
-        warnings.warn(note, stacklevel=1)
-    if notes:
-        save_json(out / WARNINGS, list(notes))
+    save_warnings(out, notes)
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:

@@ -178,13 +178,11 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
 @pytest.mark.slow
 def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
     """Runs the command of `make data=FOLDER compare` at tiny sizes, kills it in the second scene, and runs it again."""
-    from reffusion.capture import spinnerf_scenes
+    from lab.scenes import list_spinnerf
 
     for seed, name in enumerate(("1", "2", "book")):
         generate.generate(tmp_path / "data" / name, seed, generate.KINDS["mini"])
-    assert (
-        sum("8 training and 3 test views" in line for line in spinnerf_scenes.summarize_scenes(tmp_path / "data")) == 3
-    )
+    assert sum("8 training and 3 test views" in line for line in list_spinnerf.summarize_scenes(tmp_path / "data")) == 3
     small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
     command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
     command += [

@@ -19,16 +19,12 @@ from runner.pipeline import load_pipeline
 ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
 # Heavy or special dependencies, and the only modules that may import them: one module for each dependency, and for
-# transformers one for each kind of network.
+# transformers one for priors and one for other networks.
 DOORS = {
     "pycolmap": ("reffusion/capture/sfm.py",),
     "diffusers": ("reffusion/prior/model.py",),
     "peft": ("reffusion/prior/lora.py",),
-    "transformers": (
-        "reffusion/prior/model.py",
-        "reffusion/depth/monocular.py",
-        "reffusion/clicks/sam_transformers.py",
-    ),
+    "transformers": ("reffusion/prior/model.py", "reffusion/weights/transformers_model.py"),
     "huggingface_hub": ("reffusion/weights/download.py",),
     "onnxruntime": ("reffusion/onnx.py",),
     "gsply": ("reffusion/io/compressed.py",),

@@ -15,7 +15,7 @@ from reffusion.background.model import Background
 from reffusion.depth import background_depth
 from reffusion.depth.background_depth import CompletionSettings
 from reffusion.gaussians.optimize import reconstruction_loss
-from reffusion.gaussians.sheets import Sheets, sheet_gaussians
+from reffusion.gaussians.sheets import sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import coverage
 from reffusion.initialize import unprojection as rules
@@ -32,7 +32,6 @@ from stages import initialize
 pytestmark = pytest.mark.integration
 
 NEAR = 1.7
-SHEETS = Sheets()
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_normals_beside_a_crease_belong_to_their_own_plane():
 def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, closer, turn):
     disparity, view, _ = slanted_disparity(degrees)
     black, whole = np.zeros((*disparity.shape, 3), np.uint8), np.ones(disparity.shape, bool)
-    surface = sheet_gaussians(black, 1 / disparity, whole, view, 4, SHEETS)
+    surface = sheet_gaussians(black, 1 / disparity, whole, view, 4)
     rotation = yaw(np.radians(turn))
     center = (0, 0, 2.0) - rotation.T @ (0, 0, 2 / closer)
     other = make_camera("w", (16, 16), wall_scene.FOCAL, center, rotation)
@@ -81,7 +80,7 @@ def test_no_grid_shows_from_four_times_nearer(degrees):
     disparity, view, _ = slanted_disparity(degrees)
     white, whole = np.full((*disparity.shape, 3), 255, np.uint8), np.ones(disparity.shape, bool)
     near = view.cropped(view.width // 2 - 8, view.height // 2 - 8, 16, 16).resized(64, 64)
-    alpha = rasterizer.render(sheet_gaussians(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
+    alpha = rasterizer.render(sheet_gaussians(white, 1 / disparity, whole, view, 1), near).alpha
     assert alpha.min() > 0.9 and alpha.std() < 0.02
 
 
@@ -119,19 +118,21 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
     assert coverage.cameras_near_photographs(everywhere) == cameras, "with photographs all views are"
 
 
-def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
+def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side(monkeypatch):
     """With opaque Gaussians that occlude each other, colors that fit the reference are displaced in the opposite view.
 
-    The default settings of the new surface must reduce this error.
+    The two sheets of the new surface must reduce this error.
     """
     view, opposite = floor_view(0.0), floor_view(180.0)
     depth, picture = render_floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
     errors = []
-    for how in (replace(SHEETS, opacity=0.95, offset_px=0.0, spread=0.4), SHEETS):
-        background = Background([], {})
-        gaussians = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
+    opaque = lambda *surface: surface_gaussians(*surface[:-1], sh_count=surface[-1], opacity=0.95, spread=0.4)
+    for sheets in (opaque, sheet_gaussians):
+        monkeypatch.setattr(rules, "sheet_gaussians", sheets)
+        draft = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, Background([], {}), False)
+        gaussians = draft.gaussians
         inner = (slice(14, 26), slice(14, 34))
         front, back = (rasterizer.render(gaussians, v).color.numpy() - render_floor(v)[1] for v in (view, opposite))
         assert np.abs(front[inner]).mean() < 0.02
@@ -187,9 +188,9 @@ def test_the_reference_is_reproduced_by_matched_colors():
     new = surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
     labels = torch.ones(len(new), dtype=torch.bool)
     error = lambda g: np.abs(rasterizer.render(g, view).color.numpy() - picture / 255)[4:-4, 4:-4].mean()
-    matched = rules.match_colors(new, labels, picture, everything, view, 5)
+    matched = rules.match_colors(new, labels, picture, everything, view)
     assert error(matched) < 0.5 * error(new)
-    kept = rules.match_colors(new, ~labels, picture, everything, view, 5)
+    kept = rules.match_colors(new, ~labels, picture, everything, view)
     assert torch.equal(kept.sh, new.sh)
 
 
@@ -209,7 +210,7 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_color():
     new = surface_gaussians(picture, far, everything, view, sh_count=1, spread=0.4)
     both = join_gaussians(before, new)
     labels = torch.arange(len(both)) >= len(before)
-    colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view, 5).sh[labels, 0]
+    colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view).sh[labels, 0]
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
 
 
@@ -310,7 +311,7 @@ def test_a_depth_map_that_is_unknown_outside_the_hole_adds_nothing_there():
     depth, picture = render_floor(view)
     hole, unknown, nothing = np.zeros((3, *depth.shape), bool)
     hole[14:22, 16:30], unknown[:, :8] = True, True
-    floor = sheet_gaussians(picture, depth, ~nothing, view, 1, SHEETS)
+    floor = sheet_gaussians(picture, depth, ~nothing, view, 1)
     reference = Reference(view, np.uint8(255 * picture), hole | unknown, np.where(unknown, np.nan, depth))
     _, estimate, _ = rules.estimate_depth(
         rasterizer.render(floor, reference.camera), reference, hole, nothing, np.zeros((0, 3)), CompletionSettings()

@@ -17,7 +17,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
-from reffusion.masks import consolidation, regions, voting
+from reffusion.masks import regions, voting
 from reffusion.types import Similarity
 from stages.masks import Params
 
@@ -150,7 +150,7 @@ def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, m
         (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), wall_scene.CAMERAS[name])
         spot = np.hypot(columns - at[0], rows - at[1]) < 2.5
         masks[name] = wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) & ~spot
-    monkeypatch.setattr(consolidation, "GAP", 0.1)
+    monkeypatch.setattr(morphology, "GAP", 0.1)
     found = {}
     for share in (0.9, 1.0):
         (tmp_path / str(share)).mkdir()

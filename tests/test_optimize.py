@@ -392,7 +392,7 @@ def test_capped_opacities_start_over():
     optimizer = GaussianOptimizer(gaussians_near_origin(8))
     set_random_gradients(optimizer, 0)
     optimizer.step(0.0)
-    optimizer.cap_opacity(0.01)
+    optimizer.cap_opacity()
     assert optimizer.gaussians.opacity_logits.sigmoid().max() < 0.01 + 1e-6
     assert torch.all(optimizer.state_dict()["first"]["opacity_logits"] == 0)
 

@@ -60,7 +60,6 @@ FIXED = {
     "personalize.optimizer.lr_unet": 2e-4,
     "personalize.optimizer.lr_text": 4e-5,
     "personalize.samples.size": 0,
-    "personalize.samples.masks": "rectangles",
     "initialize.start": "reference",
     "distill.prior": SD2,
     "distill.sds.weight": 1e-3,
@@ -240,8 +239,6 @@ def test_constants_of_the_library():
     import torch
 
     from lab.gpu import random_priors
-    from reffusion.distill import densification
-    from reffusion.fit import step
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.metrics import image_metrics
     from reffusion.params.base import REFINED_FROM, Prompts
@@ -250,7 +247,6 @@ def test_constants_of_the_library():
     assert Prompts().texts == ["A photo of sks", "A photo of sks, cropped", ""]
     assert image_metrics.BOX_DILATION == 0.1
     assert 8 * random_priors.SD2.unet["sample_size"] == 512
-    assert densification.GROW_SCALE3D == step.GROW_SCALE3D == 0.01
     assert crops.MAX_BORDER == 0.1 and REFINED_FROM == 0.6
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}

@@ -14,7 +14,7 @@ import torch
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
 from scenes.distill_scene import random_wall, train_view, wall_camera
-from scenes.networks import save_small_prior, small_prior
+from scenes.networks import save_small_prior
 from scenes.settings import with_changes
 from scenes.stage_runs import run_masks
 from scipy.ndimage import binary_erosion
@@ -40,8 +40,7 @@ from reffusion.masks.consolidation import clean_mask
 from reffusion.params.base import Prompts
 from reffusion.params.distill import Params, SdsTerm
 from reffusion.params.fit import LearningRates
-from reffusion.params.personalize import TrainingSamples
-from reffusion.prior import crops, diffusion, lora
+from reffusion.prior import diffusion, lora
 from reffusion.seeding import generator
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
@@ -272,28 +271,6 @@ def test_no_term_shows_a_prior_or_a_critic_colors_above_1(prior, monkeypatch):
     view = train_view()
     adversarial.evaluate_adversarial(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
     assert len(seen) >= 4 and max(seen) <= 1 + 1e-5
-
-
-# ------------------------------------------------------------------------------------------------- options of RealFill
-
-
-def test_a_tenth_of_realfills_masks_repaints_all():
-    whole = {}
-    for kind in ("rectangles", "realfill"):
-        draws = generator(0, "masks")
-        samples = [crops.random_mask(TrainingSamples(masks=kind), 32, draws) for _ in range(600)]
-        assert all(((mask == 0) | (mask == 1)).all() for mask in samples)
-        whole[kind] = np.mean([bool(mask.all()) for mask in samples])
-    assert whole["rectangles"] < 0.01 and whole["realfill"] == pytest.approx(0.1, abs=0.03)
-
-
-@pytest.mark.parametrize("layers", ["attention", "qkv"])
-def test_output_projections_are_adapted_or_not(layers):
-    fresh = small_prior()
-    lora.attach(fresh, 2, 2.0, 0.0, layers, 0)
-    names = list(lora.state(fresh))
-    assert any("to_out" in name for name in names) == any("out_proj" in name for name in names) == (layers != "qkv")
-    assert all(any(part in name for name in names) for part in ("to_q", "to_k", "to_v", "q_proj", "k_proj", "v_proj"))
 
 
 # ------------------------------------------------------------------------------------------------------------- the fit

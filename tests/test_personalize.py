@@ -74,7 +74,7 @@ def test_global_samples_lose_a_thin_border_only():
     ramp = torch.arange(200.0).expand(3, 100, 200)
     source = crops.Picture(ramp, ramp[0] > 100)
     for seed in range(20):
-        cut = crops.crop_border(source, 0.1, generator(seed))
+        cut = crops.crop_border(source, generator(seed))
         height, width = cut.region.shape
         assert 80 <= height <= 100 and 160 <= width <= 200
         assert torch.equal(cut.image[0] > 100, cut.region)

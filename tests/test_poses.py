@@ -36,7 +36,8 @@ from scenes.capture import (
     write_spin_nerf,
 )
 
-from reffusion.capture import lens, normalized_frame, preparation, spinnerf_scenes
+from lab.scenes import list_spinnerf
+from reffusion.capture import lens, normalized_frame, preparation
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import assign_roles
@@ -232,7 +233,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     (tmp_path / "3/poses_bounds.npy").unlink()
     (tmp_path / "book/poses_bounds.npy").unlink()
     (tmp_path / "notes").mkdir()
-    lines = dict(line.split(": ", 1) for line in spinnerf_scenes.summarize_scenes(tmp_path))
+    lines = dict(line.split(": ", 1) for line in list_spinnerf.summarize_scenes(tmp_path))
     assert lines["1"] == "4 training and 2 test views (published: 60 and 40); images_4 96x72, images 384x288 px"
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
@@ -240,7 +241,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     run_stages(tmp_path / "book", longest=4 * WIDTH)  # the COLMAP model replaces poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
-        spinnerf_scenes.summarize_scenes(tmp_path / "notes")
+        list_spinnerf.summarize_scenes(tmp_path / "notes")
 
 
 def test_splits_from_scene_yaml(tmp_path):

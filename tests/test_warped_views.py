@@ -7,7 +7,7 @@ import pytest
 from scenes.cameras import look_at_camera
 
 from reffusion import geometry
-from reffusion.gaussians.sheets import Sheets, sheet_gaussians
+from reffusion.gaussians.sheets import sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.initialize.draft import REFERENCE, Draft
 from reffusion.initialize.refit import Supervision, refit
@@ -47,7 +47,7 @@ def filled_floor(view: Camera) -> tuple[Draft, Reference, np.ndarray]:
     """Return a draft of new Gaussians only, which show the photograph of the floor, the reference, and its depth."""
     depth, whole = floor_depth(view), np.ones((view.height, view.width), bool)
     nothing = surface_gaussians(photograph(view), depth, ~whole, view, sh_count=1)
-    added = sheet_gaussians(photograph(view), depth, whole, view, 1, Sheets())
+    added = sheet_gaussians(photograph(view), depth, whole, view, 1)
     return Draft.start(nothing).add(added, REFERENCE), Reference(view, photograph(view), whole), depth
 
 

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from lab.stability.cases import EPS64, EXACT, UNCLEAR, Case, count_unclear_refusal, nan_safe_max
+from lab.studies.conditioning import alignment_conditions
 from reffusion.depth import alignment
 
 NOISE = 1e-3  # standard deviation of the target's noise
@@ -161,7 +162,7 @@ def count_invalid_depths() -> float:
 
 def plain_condition() -> float:
     """Return the condition number of the system that `align` solves if the offset is 1e4 standard deviations."""
-    return alignment.condition_numbers(1e4 + np.random.default_rng(0).normal(size=1000))[1]
+    return alignment_conditions(1e4 + np.random.default_rng(0).normal(size=1000))[1]
 
 
 # A float64 sum over n pixels rounds by about sqrt(n) 2^-53 of its terms; data and slopes are of order one.

@@ -15,13 +15,34 @@ from pathlib import Path
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import cg, spsolve
+from scipy.sparse.linalg import cg, eigsh, spsolve
 
 from reffusion.depth import alignment, bilateral, completion
 
 HEIGHT, WIDTH = 48, 64
 SPREADS = 10.0 ** np.arange(0, 12)  # offsets of the data from zero, in units of the data's spread
 STEPS = 400  # largest number of steps of conjugate gradients
+
+
+def condition_number(matrix: sparse.spmatrix) -> float:
+    """Return the largest over the smallest eigenvalue of a symmetric positive definite matrix."""
+    start = np.ones(matrix.shape[0]) + 0.1 * np.arange(matrix.shape[0]) % 0.7  # fixed, for reproducible results
+    largest = eigsh(matrix, k=1, which="LA", v0=start, return_eigenvectors=False)[0]
+    smallest = eigsh(matrix.tocsc(), k=1, sigma=0.0, which="LM", v0=start, return_eigenvectors=False)[0]
+    return float(largest / smallest)
+
+
+def alignment_conditions(estimate: np.ndarray) -> tuple[float, float]:
+    """Return two condition numbers of the normal equations: in plain form, and in the form that `align` solves.
+
+    `align` works about the mean and in units of the spread, which decouples the two equations. The second number
+    therefore exceeds 1 only by the rounding of the mean relative to the spread.
+
+    Args:
+        estimate: [S], not constant.
+    """
+    squared = lambda column: float(np.linalg.cond(np.stack([column, np.ones(len(column))], 1)) ** 2)
+    return squared(estimate), squared((estimate - estimate.mean()) / estimate.std())
 
 
 def alignment_errors() -> list[tuple[float, float, float, float]]:
@@ -38,7 +59,7 @@ def alignment_errors() -> list[tuple[float, float, float, float]]:
         plain = np.linalg.solve([[x @ x, x.sum()], [x.sum(), float(x.size)]], [x @ truth, truth.sum()])
         ours = alignment.align(x, truth)
         error = lambda line, truth=truth: float(np.abs(line - truth).max() / np.ptp(truth))
-        rows.append((offset, alignment.condition_numbers(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
+        rows.append((offset, alignment_conditions(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
     return rows
 
 
@@ -71,7 +92,8 @@ def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
     exact = spsolve(system.tocsc(), right)
     jacobi = sparse.diags(1.0 / system.diagonal())
-    conditions = bilateral.condition_numbers(confidence, guide)
+    root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
+    conditions = condition_number(system), condition_number((root @ system @ root).tocsr())
     errors = {}
     for name, form, number in (("none", None, conditions[0]), ("Jacobi", jacobi, conditions[1])):
         iterates, began = [], time.perf_counter()
@@ -95,16 +117,15 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     tilted, errors = columns - 0.6 * rows, []
     plate = completion.Plate(ring=2.0)  # the whole map takes part, as in the absolute form
-    factors = completion.factorize(
-        completion.build_system(known.astype(float), None, np.ones(known.shape, bool), plate)
-    )
+    system = completion.build_system(known.astype(float), None, np.ones(known.shape, bool), plate)
+    factors = completion.factorize(system)
     for offset in SPREADS:
         truth = tilted + offset * np.ptp(tilted)
         absolute = factors.solve(np.where(known, truth, 0.0).ravel()).reshape(truth.shape)
         ours = completion.complete(truth, known, plate=plate)
         error = lambda x, truth=truth: float(np.abs(x - truth)[~known].max() / np.ptp(tilted))
         errors.append((offset, error(absolute), error(ours)))
-    return completion.condition_number(known.astype(float), plate=plate), errors
+    return condition_number(system), errors
 
 
 def measure(say: Callable[[str], None]) -> tuple:

@@ -21,6 +21,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from lab.studies.prior import keep_if_same, profile_params
 from lab.studies.scene_priors import run_study
@@ -155,6 +157,20 @@ def paint(prior: Prior, view: UnseenView, way: str, prompts: tuple[str, ...], se
     return inpaint.to_picture(painting)
 
 
+def distance_map(network: lpips.Lpips, images: Tensor, targets: Tensor) -> Tensor:
+    """Return the contribution of each pixel to the LPIPS distance, [B, H, W], whose mean is about the distance.
+
+    The map of each layer is enlarged to the images' size.
+
+    Args:
+        network: the metric.
+        images, targets: [B, 3, H, W] in [-1, 1].
+    """
+    maps = zip(network.activations(images), network.activations(targets), network.linear, strict=True)
+    layers = [((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1, keepdim=True) for a, b, w in maps]
+    return sum(F.interpolate(each, images.shape[2:], mode="bilinear", align_corners=False) for each in layers)[:, 0]
+
+
 def make_scorer() -> Callable[[np.ndarray, UnseenView], dict[str, float]]:
     """Return a function that scores a picture of a view: network -> mean of LPIPS's map over the unseen pixels.
 
@@ -172,7 +188,7 @@ def make_scorer() -> Callable[[np.ndarray, UnseenView], dict[str, float]]:
     @torch.no_grad()
     def score(picture: np.ndarray, view: UnseenView) -> dict[str, float]:
         pair = tensor(picture), tensor(view.truth)
-        return {net: float(each.distance_map(*pair)[0][view.unseen].mean()) for net, each in networks.items()}
+        return {net: float(distance_map(each, *pair)[0][view.unseen].mean()) for net, each in networks.items()}
 
     return score
 

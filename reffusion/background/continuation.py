@@ -45,9 +45,7 @@ ENCLOSED = 0.8  # a free patch is enclosed if a larger share of its border is se
 TOUCHING = 0.25  # a plane continues into an unknown patch only if a larger share of the patch's border is seen
 
 
-def find_planes(
-    center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray, seed: int = 0
-) -> list[Plane]:
+def find_planes(center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray) -> list[Plane]:
     """Find the planes around the removed object, with the cells into which they continue.
 
     Planes are fitted by RANSAC to samples, i.e. points of the surfaces around the masks, taken from several views. One
@@ -60,18 +58,17 @@ def find_planes(
         radius: radius around the center that contains most of the removed object.
         views: depth of the training views, rendered with the object.
         points: [P, 3], the scene's sparse points; P = 0 is allowed.
-        seed: seed of the random draws.
 
     Returns:
         Up to `MAX_PLANES` planes in the order in which RANSAC found them, about by decreasing number of samples; then
         the third faces. The list is empty if there are too few samples.
     """
-    samples = sample_surfaces(center, REACH * radius, views, seed)
+    samples = sample_surfaces(center, REACH * radius, views)
     points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
     inlier, unexplained = INLIER * radius, np.ones(len(samples), bool)
     distance = float(np.median([np.linalg.norm(view.camera.center - center) for view in views])) if views else 0.0
     found: list[tuple[np.ndarray, float]] = []
-    generator = np.random.default_rng(seeding.seed_for(seed, "planes around"))
+    generator = np.random.default_rng(seeding.seed_for(0, "planes around"))
     least = max(MIN_SAMPLES, MIN_SHARE * len(samples))
     for normal, offset in search_planes(samples, inlier, generator, least, CLAIMED):
         refined = refine_by_points(normal, offset, points, inlier, MIN_SPREAD * radius)
@@ -163,9 +160,7 @@ def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarra
 
 def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
     """Return the convex hull [CELLS, CELLS] of a plane's large seen patches, the region in which it may continue."""
-    patches, count = ndimage.label(_without_rims(seen))
-    areas = np.bincount(patches.ravel(), minlength=count + 1)
-    areas[0] = 0
+    patches, areas = morphology.label_sizes(_without_rims(seen))
     large = (areas >= MIN_PATCH * max(areas.max(), 1))[patches]
     standing = plane.cell_centers[large]
     # The surface may stand on `grounds`, planes that cross it and have more samples. Seen cells are projected down onto
@@ -214,8 +209,8 @@ def _map_plane(
 def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
     """Return bool [CELLS, CELLS], the patches of fewer than `min_cells` free cells; none at the map's border."""
     # Depth errors beside the object's edge make small patches. A patch at the map's border may continue beyond the map.
-    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # joins all patches at the map's border
-    areas = np.bincount(patches.ravel(), minlength=count + 1)
+    # the padding joins all patches at the map's border
+    patches, areas = morphology.label_sizes(np.pad(free, 1, constant_values=True))
     return free & (areas < min_cells)[patches][1:-1, 1:-1]
 
 

@@ -95,7 +95,7 @@ class Background:
         points = geometry.unproject(depth, camera).reshape(-1, 3)
         return count_views(points, self.views).is_empty.reshape(depth.shape)
 
-    def with_surfaces(self, object_means: Tensor, remaining: Gaussians, seed: int = 0) -> Background:
+    def with_surfaces(self, object_means: Tensor, remaining: Gaussians) -> Background:
         """Return the background with newly found planes and mirrors, and the center and radius of the object.
 
         Mirrors are symmetric things around the object, with their mirror planes.
@@ -103,12 +103,11 @@ class Background:
         Args:
             object_means: [N, 3], the centers of the removed Gaussians. If N is 0, the background stays as it is.
             remaining: the Gaussians of the scene without the removed ones.
-            seed: seed of the random draws.
         """
         if not len(object_means):
             return self
         center, radius = robust_extent(object_means)
-        planes = find_planes(center, radius, self.views, self.points, seed)
+        planes = find_planes(center, radius, self.views, self.points)
         mirrors = find_mirrors(remaining, center, radius, self.views, planes, self.photos)
         return replace(self, planes=planes, mirrors=mirrors, center=center, radius=radius)
 

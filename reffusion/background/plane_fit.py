@@ -24,19 +24,18 @@ TRIALS = 300  # RANSAC trials for each plane
 INLIER_STEPS, MIN_INLIERS, MIN_SHARPNESS, MAX_TURN = (1.0, 0.5, 0.25), 50, 0.5, 0.98
 
 
-def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView], seed: int) -> np.ndarray:
+def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView]) -> np.ndarray:
     """Return samples of the visible surfaces: random points of the surfaces that views show around their masks.
 
     Args:
         center: [3], the middle of the removed object.
         radius: largest distance of a sample from the center.
         views: depth of the training views, rendered with the object.
-        seed: seed of the random choice of pixels.
 
     Returns:
         [S, 3], world points; S may be 0.
     """
-    generator, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
+    generator, found = np.random.default_rng(seeding.seed_for(0, "surfaces around")), [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
         rows, columns = np.nonzero(dilate_by_distance(view.masked, RING) & ~view.masked & (view.depth > 0))
         if len(rows):

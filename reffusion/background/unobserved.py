@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
@@ -46,7 +45,6 @@ class HoleGeometry:
             plausible mirror image of a symmetric thing; inf where there is neither, and at all other pixels.
         depth: [H, W] float64 camera z, rendered from the remaining Gaussians (those without the object). Outside the
             mask it is the depth that the view shows with the object, if the view is among the training views.
-        alpha: [H, W] float64, rendered from the remaining Gaussians.
         plane_depths: [H, W] each, for every plane that continues in this view its depth at all pixels, inf where a ray
             does not meet it. If there are mirrors, the last entry is the depth of their mirror images, inf elsewhere.
         confirmed: bool [H, W], True at the pixels of C where at least `CONFIRMING_VIEWS` views show the rendered
@@ -56,7 +54,6 @@ class HoleGeometry:
     unobserved: np.ndarray
     continued_depth: np.ndarray
     depth: np.ndarray
-    alpha: np.ndarray
     plane_depths: tuple[np.ndarray, ...]
     confirmed: np.ndarray
 
@@ -118,7 +115,7 @@ def find_unobserved(
     below = _below_planes(planes, camera, depth, mask)
     confirmed = morphology.remove_slivers(confirmed & ~occluding & ~below, MASK_MARGIN) & mask
     continued_depth = np.where(unobserved, nearest, np.inf)
-    return HoleGeometry(unobserved, continued_depth, depth, alpha, tuple(plane_depths), confirmed)
+    return HoleGeometry(unobserved, continued_depth, depth, tuple(plane_depths), confirmed)
 
 
 def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -138,7 +135,7 @@ def _continues_surroundings(
     if not patch.any():
         return False
     radius = max(3, round(RING * patch.shape[1]))
-    ring = cv2.dilate(patch.astype(np.uint8), morphology.square(radius)) > 0
+    ring = morphology.dilate_square(patch, radius)
     ring &= known & np.isfinite(plane_depth)
     # pixels at which views see through the plane are ignored
     ring &= ~plane.pixels_on(plane.free, plane_depth, camera, ring)

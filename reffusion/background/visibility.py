@@ -66,13 +66,9 @@ class DepthView:
         return cls(camera, depth.astype(np.float32), near_ratio.astype(np.uint16), far_ratio.astype(np.uint16), masked)
 
     @classmethod
-    def from_depth(cls, camera: Camera, depth: np.ndarray, mask: np.ndarray, margin: float = MASK_MARGIN) -> Self:
-        """Construct a DepthView from a depth map, float32 [H, W], and the object's mask, bool [H, W].
-
-        Args:
-            margin: dilation of the mask, as a fraction of the image's width.
-        """
-        return cls.from_range(camera, depth, depth_range(depth), morphology.dilate(mask, margin))
+    def from_depth(cls, camera: Camera, depth: np.ndarray, mask: np.ndarray) -> Self:
+        """Construct a DepthView from a depth map, float32 [H, W], and the object's mask, bool [H, W]."""
+        return cls.from_range(camera, depth, depth_range(depth), morphology.dilate(mask, MASK_MARGIN))
 
     @property
     def nearest(self) -> np.ndarray:
@@ -87,7 +83,7 @@ class DepthView:
 
 @torch.no_grad()
 def render_depth_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], margin: float = MASK_MARGIN
+    gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]
 ) -> list[DepthView]:
     """Render the depth of every view.
 
@@ -96,10 +92,9 @@ def render_depth_views(
         cameras: the views.
         masks: view name -> bool [H, W], True at pixels that show the object; all False for a view that was photographed
             without the object.
-        margin: dilation of the masks, as a fraction of the image's width.
     """
     depths = ((camera, opaque_depth(rasterizer.render(gaussians, camera, sh_degree=0))) for camera in cameras)
-    return [DepthView.from_depth(camera, depth, masks[camera.name], margin) for camera, depth in depths]
+    return [DepthView.from_depth(camera, depth, masks[camera.name]) for camera, depth in depths]
 
 
 def opaque_depth(rendering: Rendering) -> np.ndarray:

@@ -28,7 +28,6 @@ from reffusion.params.capture import MaskSpec
 
 NONE = "none"
 IGNORE, ALL_VIEWS = "ignore", "all"  # usual folder of masks of what is ignored, and the name of a mask for every view
-COMPANIONS = (".txt", ".xml", ".xmp", ".csv", ".yaml", ".thm", "")  # endings of files beside a picture that are none
 CVAT = "annotations.xml"  # CVAT's own file, which is not read
 USUAL = (
     "masks",

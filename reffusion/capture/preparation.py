@@ -23,8 +23,9 @@ from reffusion.capture.own_splats import OwnSplats
 from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
 from reffusion.capture.scene_folder import read_scene
-from reffusion.capture.undistort import fitting_size, load_resized
+from reffusion.capture.undistort import load_resized
 from reffusion.capture.views import check_outliers
+from reffusion.io.images import fitting_size
 from reffusion.params.poses import Params
 from reffusion.params.reference import reference_list
 from reffusion.splat.conventions import SH0

@@ -12,14 +12,8 @@ from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undist
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
 from reffusion.io.given_masks import WHITE, MaskValues, load_given_mask, load_united_masks, mask_file_size
-from reffusion.io.images import image_size, load_alpha, load_image, resize_image, save_image, save_mask
+from reffusion.io.images import fitting_size, image_size, load_alpha, load_image, resize_image, save_image, save_mask
 from reffusion.io.scene import IGNORED
-
-
-def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
-    """Return the (width, height) of a picture reduced so that its longer side is at most `longest`; never enlarged."""
-    factor = min(1.0, longest / max(width, height))
-    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def load_resized(path: Path, longest: int, upright: bool) -> np.ndarray:

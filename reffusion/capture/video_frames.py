@@ -20,10 +20,9 @@ from PIL import Image
 
 from reffusion import trace
 from reffusion.capture.layouts.unread import ARCHIVES
-from reffusion.capture.undistort import fitting_size
 from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
-from reffusion.io.images import ENDINGS, resize_image
+from reffusion.io.images import ENDINGS, fitting_size, resize_image
 from reffusion.io.splats import FORMATS
 
 MOST = 80  # largest number of selected frames: all their pairs can be matched within minutes

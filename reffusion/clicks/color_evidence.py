@@ -9,7 +9,6 @@ the unknown Gaussians.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -28,19 +27,6 @@ RING = 0.12  # share of the larger side: how far around the object background co
 FRONT_PERCENTILE = 5  # percentile of the depths in a mask that is taken as the depth of the object's front
 OCCLUDER_DEPTH = 0.98  # share of the front's depth: a surface nearer than this may hide the object
 LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of likelihoods
-
-
-@dataclass(frozen=True)
-class KnownLabels:
-    """Labels of the N Gaussians as far as they are known. A Gaussian in neither array has no known label.
-
-    Attributes:
-        inside: bool [N], True = belongs to the object.
-        outside: bool [N], True = does not belong to the object.
-    """
-
-    inside: np.ndarray
-    outside: np.ndarray
 
 
 def find_outside(
@@ -71,14 +57,19 @@ def find_outside(
 
 
 def color_votes(
-    gaussians: Gaussians, known: KnownLabels, cameras: Mapping[str, Camera], image_of: Callable[[str], np.ndarray]
+    gaussians: Gaussians,
+    inside: np.ndarray,
+    outside: np.ndarray,
+    cameras: Mapping[str, Camera],
+    image_of: Callable[[str], np.ndarray],
 ) -> np.ndarray:
     """Return float [N, 2]: for each Gaussian how much its colors resemble the object, and how well views show it.
 
     Up to `VIEWS` views, evenly spaced in the order of their names, are compared at a larger side of at most `LONGEST`.
 
     Args:
-        known: the Gaussians whose pixels give the colors of object and background.
+        inside, outside: bool [N], True = belongs, or does not belong, to the object. The pixels of these Gaussians give
+            the colors of object and background. A Gaussian in neither array has no known label.
         cameras: view -> Camera, the views without masks.
         image_of: view -> photograph, uint8 [H, W, 3].
 
@@ -90,12 +81,10 @@ def color_votes(
     """
     names = sorted(cameras)
     sums, means = np.zeros((len(gaussians), 2)), gaussians.means
-    features = torch.as_tensor(np.stack([known.inside, known.outside], 1)).to(means)
+    features = torch.as_tensor(np.stack([inside, outside], 1)).to(means)
     chosen = sample_evenly(names, VIEWS)
     for name in chosen:
-        width, height = cameras[name].width, cameras[name].height
-        factor = min(1.0, LONGEST / max(width, height))
-        camera = cameras[name].resized(max(1, round(width * factor)), max(1, round(height * factor)))
+        camera = cameras[name].shrunk(LONGEST)
         with torch.no_grad():
             drawn = rasterizer.render(gaussians, camera, features=features, sh_degree=0).features.cpu().numpy()
         image = cv2.resize(image_of(name), (camera.width, camera.height), interpolation=cv2.INTER_AREA)

@@ -7,6 +7,8 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion.clicks.marks import Clicks, mark_pixels
+from reffusion.graph_cut import neighbor_pairs
+from reffusion.io.images import fitting_size
 
 LONGEST = 192  # px, the larger side of the picture that is segmented
 # Slope of the relief (`ViewEvidence.relief`) in px per px: the largest within a surface, and the smallest of a certain
@@ -20,8 +22,7 @@ def downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int,
     Returns:
         Colors float64 [h * w, 3] in 8-bit L*a*b*; (h, w); marks int8 [h, w], OBJECT, OTHER or UNKNOWN.
     """
-    factor = min(1.0, LONGEST / max(image.shape[:2]))
-    height, width = (max(1, round(side * factor)) for side in image.shape[:2])
+    width, height = fitting_size(image.shape[1], image.shape[0], LONGEST)
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).reshape(-1, 3).astype(np.float64)
     at = Clicks(clicks.points * (width / image.shape[1], height / image.shape[0]), clicks.positive)
@@ -34,21 +35,8 @@ def upscale(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def pixel_pairs(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs int [E, 2] of neighboring pixels (8-neighborhood), and their distances [E] in pixels.
-
-    Pixels are numbered row by row.
-
-    Args:
-        shape: (height, width).
-    """
-    index, pairs, length = np.arange(shape[0] * shape[1]).reshape(shape), [], []
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        width = shape[1] - abs(right)
-        first = index[: shape[0] - down, max(0, -right) :][:, :width]
-        second = index[down:, max(0, right) :][:, :width]
-        pairs.append(np.stack([first.ravel(), second.ravel()], 1))
-        length.append(np.full(first.size, np.hypot(down, right)))
-    return np.concatenate(pairs), np.concatenate(length)
+    """Return `neighbor_pairs` of a picture of (height, width), whose pixels are numbered row by row."""
+    return neighbor_pairs(np.arange(shape[0] * shape[1]).reshape(shape))
 
 
 def find_depth_edges(

@@ -16,7 +16,7 @@ votes contradict it.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,11 +26,11 @@ from reffusion import trace
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
 from reffusion.clicks.pixel_grid import DEPTH_SLOPE
-from reffusion.clicks.propagation_without_network import remove_rim
+from reffusion.clicks.propagation_without_network import count_votes
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.clicks.support_planes import find_support_gaussians
-from reffusion.morphology import open_mask
+from reffusion.morphology import label_sizes, open_mask
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -78,10 +78,6 @@ class Votes:
         """[N] in [0, 1], the share of each Gaussian's votes for the object; 0 for Gaussians without a label."""
         return np.where(self.has_label, self.counts[:, 0] / np.maximum(self.counts.sum(1), self.least), 0.0)
 
-    def plus(self, counts: np.ndarray) -> Votes:
-        """Return the sum of these votes and of `counts` [N, 2], the votes of a further view."""
-        return Votes(self.counts + counts, self.least)
-
 
 @dataclass(frozen=True)
 class Projection:
@@ -128,7 +124,8 @@ def propagate_masks(
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
-            votes = votes.plus(count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief)))
+            counts = count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief))
+            votes = replace(votes, counts=votes.counts + counts)
     votes, found = assume_supports(gaussians, votes), dict(masks)
     for name in order:
         projection = project_votes(gaussians, cameras[name], votes)
@@ -161,9 +158,7 @@ def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarra
     smooth = ndimage.median_filter(relief, 3)
     level = mask & (np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)) / 8 < DEPTH_SLOPE[0])
     reached = ndimage.binary_dilation(middle & level, around, round(1.5 * width), mask=level)
-    parts, _ = ndimage.label(reached, around)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
+    parts, sizes = label_sizes(reached, around)
     voting = reached & (sizes >= min(4 * width**2, MIN_PART * sizes.max()))[parts]
     if not voting.any():
         return mask
@@ -202,21 +197,6 @@ def count_all_votes(
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
     return Votes(np.sum(counts, 0), LEAST_WEIGHT * float(shown.mean()) if len(shown) else SHOWN)
-
-
-@torch.no_grad()
-def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray, voting: np.ndarray | None = None) -> np.ndarray:
-    """Return [N, 2], each Gaussian's blending weight summed over the pixels inside and outside a mask, in px.
-
-    Pixels at the mask's border do not count.
-
-    Args:
-        mask: bool [H, W], True = the object.
-        voting: bool [H, W], the pixels inside the mask that vote; None for all.
-    """
-    inside = remove_rim(mask) if voting is None else remove_rim(mask) & voting
-    ballots = torch.as_tensor(np.stack([inside, remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
-    return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
 
 
 def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
@@ -374,17 +354,13 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 def _large_parts(mask: np.ndarray, least: float) -> list[np.ndarray]:
     """Return the connected parts of a mask that have at least `least` pixels, bool [H, W] each, the largest first."""
-    parts, _ = ndimage.label(mask)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
+    parts, sizes = label_sizes(mask)
     return [parts == k for k in np.argsort(-sizes, kind="stable") if sizes[k] >= max(least, 1)]
 
 
 def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
     """Return the mask without connected parts that are smaller than the share `MIN_PART` of the largest part."""
-    parts, _ = ndimage.label(mask)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
+    parts, sizes = label_sizes(mask)
     return mask & (sizes >= MIN_PART * sizes.max())[parts]
 
 

@@ -75,10 +75,7 @@ def label_gaussians(
     """
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
-        ballots = torch.as_tensor(
-            np.stack([remove_rim(mask, rim), remove_rim(~mask, rim)], -1), device=gaussians.means.device
-        )
-        sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
+        sure += count_votes(gaussians, cameras[name], mask, rim=rim)
     inside, outside = sure.T
     margin = max(1, round(rim * max(next(iter(masks.values())).shape)))
     outside_mask = color_evidence.find_outside(gaussians, cameras, masks, margin) & (inside < LEAST_VOTE)
@@ -87,22 +84,34 @@ def label_gaussians(
         np.where(outside_mask, LARGEST_VOTE, np.minimum(outside, LARGEST_VOTE)),
     )
     others = {name: camera for name, camera in cameras.items() if name not in masks}
-    known = color_evidence.KnownLabels(
-        inside > np.maximum(LEAST_VOTE, outside), outside > np.maximum(LEAST_VOTE, inside)
-    )
-    side, labels = relative_distance(near.pairs, near.way, known.inside, known.outside), known.inside
+    is_object, is_other = inside > np.maximum(LEAST_VOTE, outside), outside > np.maximum(LEAST_VOTE, inside)
+    side, labels = relative_distance(near.pairs, near.way, is_object, is_other), is_object
     for _ in range(ROUNDS):
-        log_ratio, coverage = color_evidence.color_votes(
-            gaussians, color_evidence.KnownLabels(labels, known.outside), others, image_of
-        ).T
-        gain = (
-            np.minimum(COLOR * coverage, LARGEST_VOTE) * (log_ratio + NEARER * side) * ~(known.inside | known.outside)
-        )
+        log_ratio, coverage = color_evidence.color_votes(gaussians, labels, is_other, others, image_of).T
+        gain = np.minimum(COLOR * coverage, LARGEST_VOTE) * (log_ratio + NEARER * side) * ~(is_object | is_other)
         before, against, for_it = labels, outside + np.maximum(-gain, 0), inside + np.maximum(gain, 0)
-        labels = keep_connected(min_cut(against, for_it, near.pairs, near.likeness), near.pairs, known.inside)
+        labels = keep_connected(min_cut(against, for_it, near.pairs, near.likeness), near.pairs, is_object)
         if (labels == before).all():
             break
     return torch.as_tensor(labels, device=gaussians.means.device)
+
+
+@torch.no_grad()
+def count_votes(
+    gaussians: Gaussians, camera: Camera, mask: np.ndarray, allowed: np.ndarray | None = None, rim: float = RIM
+) -> np.ndarray:
+    """Return [N, 2], each Gaussian's blending weight summed over the pixels inside and outside a mask, in px.
+
+    Pixels at the mask's border do not count.
+
+    Args:
+        mask: bool [H, W], True = the object.
+        allowed: bool [H, W], the pixels inside the mask that may vote; None for all.
+        rim: as in `remove_rim`.
+    """
+    inside = remove_rim(mask, rim) if allowed is None else remove_rim(mask, rim) & allowed
+    ballots = torch.as_tensor(np.stack([inside, remove_rim(~mask, rim)], -1), dtype=gaussians.means.dtype)
+    return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
 
 
 def object_mask(gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray) -> np.ndarray:

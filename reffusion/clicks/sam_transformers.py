@@ -5,7 +5,6 @@ Pictures are prepared in `reffusion.clicks.segmenter`, because the library's own
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 
 from reffusion.clicks.segmenter import LOWER_RIGHT, UPPER_LEFT, Segmenter
 from reffusion.weights import local
+from reffusion.weights.transformers_model import load_model
 
 SOURCE = "facebook/sam-vit-base"
 KIND = "sam"
@@ -33,25 +33,13 @@ def load_sam(source: str | Path = SOURCE) -> Segmenter | None:
         ValueError: `source` is neither a folder nor a hub id, or the folder holds no model, an incomplete one, or a
             model of another kind.
     """
-    from transformers import AutoConfig, SamModel
-    from transformers.utils import logging as transformers_logging
-
     folder = local.locate(source)
     if folder is None:
         return None
-    if not (folder / "config.json").is_file():
-        raise ValueError(f"segmentation network {folder}: it lacks config.json; it must be a transformers model folder")
-    transformers_logging.disable_progress_bar()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            kind = AutoConfig.from_pretrained(folder).model_type
-            if kind != KIND:
-                raise ValueError(f"a model of type {kind!r}; those of type {KIND!r} are understood")
-            model = SamModel.from_pretrained(folder, dtype=torch.float32)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"segmentation network {folder}: {str(error).splitlines()[0]}") from error
-    return wrap_model(model, str(source))
+        return wrap_model(load_model(folder, KIND, "SamModel"), str(source))
+    except ValueError as error:
+        raise ValueError(f"segmentation network {error}") from error
 
 
 def wrap_model(model: nn.Module, name: str = SOURCE) -> Segmenter:

@@ -206,13 +206,9 @@ def correct_own_view(
     name = events[-1].view
     found: Masks = {name: masks[name]}
     for k in range(len(events) - count + 1, len(events) + 1):
-        step = partial(_correct_view, views, events[:k], found[name])
+        step = lambda past=events[:k], before=found[name]: {name: correct_view(views, past, before)}
         found = recall(("corrected view", *(event.key for event in events[:k])), step)
     return dict(found)
-
-
-def _correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> Masks:
-    return {events[-1].view: correct_view(views, events, before)}
 
 
 def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> np.ndarray:

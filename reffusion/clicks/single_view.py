@@ -18,6 +18,7 @@ from reffusion.clicks.marks import OBJECT, OTHER, Clicks, mark_pixels
 from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
 from reffusion.clicks.pixel_grid import downscale, find_depth_edges, pixel_pairs, upscale, value_at
 from reffusion.clicks.segmenter import Candidate, Prompt
+from reffusion.morphology import label_sizes
 
 LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
 LEAST_REGION = 12  # number of pixels (at the size for segmentation) that a region with a click must have
@@ -173,8 +174,8 @@ def _select_candidate(
 def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
     """Return whether every mark that agrees with the mask lies in a region of at least `LEAST_REGION` pixels."""
     for side, kind in ((mask, OBJECT), (~mask, OTHER)):
-        parts, _ = ndimage.label(side, np.ones((3, 3)))
-        if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=LEAST_REGION) < LEAST_REGION:
+        parts, sizes = label_sizes(side, np.ones((3, 3)))
+        if sizes[parts[(marks == kind) & side]].min(initial=LEAST_REGION) < LEAST_REGION:
             return False
     return True
 
@@ -182,16 +183,11 @@ def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
 def _fill_holes(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
     """Return the labels [h * w] as a mask [h, w], with holes filled unless they contain a negative mark."""
     mask = labels.reshape(marks.shape)
-    return mask | (ndimage.binary_fill_holes(mask) & ~_marked_holes(marks == OTHER, mask))
+    marked = ndimage.binary_propagation((marks == OTHER) & ~mask, mask=~mask)
+    return mask | (ndimage.binary_fill_holes(mask) & ~marked)
 
 
 def _ring(mask: np.ndarray) -> np.ndarray:
     """Return bool [h, w], a ring around a mask, wider for larger masks and one pixel away from the mask."""
     far = max(3, round(RING * float(np.sqrt(mask.sum()))))
     return ~erode(~mask, far) & erode(~mask, 1)
-
-
-def _marked_holes(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the connected parts outside the mask that contain a marked pixel, bool [H, W]."""
-    holes, _ = ndimage.label(~mask)
-    return np.isin(holes, holes[marks & ~mask])

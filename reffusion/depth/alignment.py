@@ -82,24 +82,6 @@ def align(
     return _robust_line(x, y, w, plain, seeding.generator(seed, "align")) if robust else plain
 
 
-def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
-    """Return two condition numbers of the normal equations: first in plain form, then in the form that `align` solves.
-
-    `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. The
-    second number therefore exceeds 1 only by the rounding of the mean relative to the spread.
-
-    Args:
-        estimate, weights: As in `align`. The estimate is not constant.
-    """
-    estimate = np.asarray(estimate, np.float64)
-    weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
-    x, root = estimate[weights > 0], np.sqrt(weights[weights > 0])
-    center = np.average(x, weights=root**2)
-    spread = np.sqrt(np.average((x - center) ** 2, weights=root**2))
-    squared = lambda column: float(np.linalg.cond(np.stack([column * root, root], 1)) ** 2)
-    return squared(x), squared((x - center) / spread)
-
-
 def _robust_line(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, generator: torch.Generator
 ) -> Alignment:
@@ -113,7 +95,7 @@ def _robust_line(
             inlier = error <= 1e-9 * np.abs(y).max()  # an exact fit up to rounding: no weighting needed
             has_spread = np.ptp(x[inlier]) > MIN_RELATIVE_SPREAD * np.abs(x[inlier]).max()
             return _weighted_line(x[inlier], y[inlier], w[inlier]) if has_spread else result
-        updated = _weighted_line(x, y, w * geman_mcclure_weights(error, spread))
+        updated = _weighted_line(x, y, w * _geman_mcclure_weights(error, spread))
         change = np.abs(updated.apply(x) - result.apply(x)).max()
         result = updated
         if change < 1e-9 * np.abs(y).max():
@@ -121,7 +103,7 @@ def _robust_line(
     return result
 
 
-def geman_mcclure_weights(error: np.ndarray, spread: float) -> np.ndarray:
+def _geman_mcclure_weights(error: np.ndarray, spread: float) -> np.ndarray:
     """Return the Geman-McClure weights, in (0, 1], of absolute residuals.
 
     Args:

@@ -45,10 +45,6 @@ class CompletionSettings:
         ring: Width of the surroundings, as a fraction of the image's width.
         planar_share: Share of the surroundings that planes must explain to be used. A value above 1 excludes planes.
         planar_tolerance: Relative difference in disparity up to which planes explain a sample.
-        stiffness, edge: See `completion.Plate`.
-        unknowns: `most_unknowns` of `completion.Plate`.
-        solver_smoothness, solver_spatial, solver_luma, solver_chroma: See `bilateral.Solver`.
-        robust: Whether outliers are rejected when a monocular estimate is aligned, see `alignment.align`.
         seed: Seed of the random samples in the search for planes.
     """
 
@@ -57,20 +53,7 @@ class CompletionSettings:
     ring: float = 0.08
     planar_share: float = 0.8
     planar_tolerance: float = 0.01
-    stiffness: float = 100.0
-    edge: float = 0.1
-    unknowns: int = 60_000
-    solver_smoothness: float = 128.0
-    solver_spatial: float = 8.0
-    solver_luma: float = 8.0
-    solver_chroma: float = 8.0
-    robust: bool = False
     seed: int = 0
-
-    @property
-    def solver(self) -> bilateral.Solver:
-        """Return the parameters of the bilateral solver."""
-        return bilateral.Solver(self.solver_smoothness, self.solver_spatial, self.solver_luma, self.solver_chroma)
 
 
 @dataclass(frozen=True)
@@ -221,7 +204,7 @@ def continue_depth(
             return planar.disparity, description
         description = f"{description}, but occlude known free space in {refuted:.0%} of the hole"
     guide = guide() if callable(guide) else guide
-    plate = Plate(settings.ring, settings.stiffness, settings.edge, settings.unknowns)
+    plate = Plate(ring=settings.ring)
     usable = view.known | view.anchored
     near = lambda fraction: morphology.dilate_by_distance(view.hole, fraction)
     surroundings, hole = usable & near(settings.ring), near(settings.margin)
@@ -233,7 +216,7 @@ def continue_depth(
     if surfaces.max() <= 1:
         share = view.anchored.sum() / max(view.hole.sum(), 1)
         onward = f", planes that continue in {share:.0%} of the hole" if share else ""
-        smooth = _complete_smoothly(view, usable, guide, plate, settings, log)
+        smooth = _complete_smoothly(view, usable, guide, plate, log)
         return smooth, f"{description}: continued smoothly instead{onward}"
     if farthest:
         disparity = np.where(view.anchored, view.disparity, _complete_gaps(view, surfaces, usable, guide, plate))
@@ -249,14 +232,14 @@ def continue_depth(
 
 
 def _complete_smoothly(
-    view: ViewDepth, usable: np.ndarray, guide: np.ndarray, plate: Plate, settings: CompletionSettings, log: SolverLog
+    view: ViewDepth, usable: np.ndarray, guide: np.ndarray, plate: Plate, log: SolverLog
 ) -> np.ndarray:
     """Return disparity [H, W] that continues the pixels `usable`, bool [H, W], as one smooth surface."""
     smooth = complete(view.disparity, usable, guide, plate, keep=False)
     log.log_result("completion", smooth)
     # The bilateral solver spreads the residuals of known pixels into the hole, so that its border shows no step.
     confidence = usable.astype(np.float64)
-    refined = bilateral.refine(smooth, view.disparity, confidence, guide, settings.solver, log.log_iteration)
+    refined = bilateral.refine(smooth, view.disparity, confidence, guide, watch=log.log_iteration)
     log.log_result("bilateral", refined, log.iterations)
     return np.where(view.anchored, view.disparity, refined)
 
@@ -275,8 +258,7 @@ def _complete_gaps(
     """Return disparity [H, W] in which each gap of the hole continues the farthest of the surfaces that it touches."""
     result, continued = view.disparity.copy(), {}
     gaps, count = ndimage.label(view.hole, np.ones((3, 3)))
-    nearest = ndimage.distance_transform_edt(~view.hole, return_distances=False, return_indices=True)
-    nearest_gap = gaps[tuple(nearest)]
+    nearest_gap = gaps[morphology.nearest_known(view.hole)]
     for gap in range(1, count + 1):
         # `usable` pixels have a known or an anchored disparity.
         border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(gaps == gap, GAP_RING)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from reffusion.depth.completion import check_maps, extremes_ratio, unit_range
+from reffusion.depth.completion import check_maps, unit_range
 from reffusion.geometry import Degenerate
 
 UNREACHED = 1e-9  # added to every pixel's confidence: keeps the system regular, and cells without data at the mean
@@ -151,20 +151,6 @@ def build_system(
     data = sparse.diags(gather(confidence) + UNREACHED * mass)
     system = solver.smoothness * _laplacian(_blur(coordinates), mass, solver.rounds) + data
     return system.tocsr(), cell
-
-
-def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
-    """Return two condition numbers of the solver's system: without preconditioner, and with the Jacobi preconditioner.
-
-    The system is that of the default `Solver`. The condition number is the largest eigenvalue over the smallest. Its
-    square root is about the number of iterations of conjugate gradients. `solve` uses the preconditioner.
-
-    Args:
-        confidence, guide: As in `solve`.
-    """
-    system, _ = build_system(np.asarray(confidence, np.float64), guide)
-    root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
-    return extremes_ratio(system), extremes_ratio((root @ system @ root).tocsr())
 
 
 def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera
         facing_normal = _billboard_normal(view_direction / np.linalg.norm(view_direction), normal)
         camera_normal = facing_normal @ camera.world_to_camera[:3, :3].T  # in camera axes
         plane_depth = (facing_normal @ view_direction) / np.minimum(rays @ camera_normal, -1e-3)
-        bulge_depth = _profile(component) * BULGE * _half_width_px(component) * foot_depth / camera.fx
+        bulge_depth = _profile(component) * BULGE * (component.sum(1).max() / 2) * foot_depth / camera.fx
         object_depth = np.clip(plane_depth, 0.5 * foot_depth, 2 * foot_depth) - bulge_depth
         result[component] = np.minimum(object_depth, depth)[component]
     return result
@@ -74,8 +74,3 @@ def _profile(component: np.ndarray) -> np.ndarray:
     distance = np.maximum(ndimage.distance_transform_edt(np.pad(component, 1))[1:-1, 1:-1] - 1, 0)
     normalized = distance / max(distance.max(), 1.0)
     return np.sqrt(1 - (1 - normalized) ** 2)
-
-
-def _half_width_px(component: np.ndarray) -> float:
-    """Return half the width of the component's widest row, in pixels."""
-    return component.sum(1).max() / 2

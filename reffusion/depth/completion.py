@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.sparse.linalg import eigsh, splu
+from scipy.sparse.linalg import splu
 
 from reffusion.depth.planes import fit_plane
 from reffusion.geometry import Degenerate
@@ -156,33 +156,6 @@ def build_system(confidence: np.ndarray, guide: np.ndarray | None, domain: np.nd
 def factorize(system: sparse.csc_matrix):
     """Return the sparse LU factors of a symmetric matrix, whose method `solve` takes a right-hand side."""
     return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-def condition_number(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = DEFAULT_PLATE) -> float:
-    """Return the condition number of the completion's system over a whole map [H, W]: largest over smallest eigenvalue.
-
-    Rounding errors of the largest value on the right-hand side are amplified by up to this factor. Therefore `complete`
-    solves for a correction to a plane, whose values are small.
-
-    Args:
-        confidence, guide, plate: As in `complete`.
-    """
-    confidence = np.asarray(confidence, np.float64)
-    colors = None if guide is None else unit_range(guide)
-    return extremes_ratio(build_system(confidence, colors, np.ones(confidence.shape, bool), plate))
-
-
-def extremes_ratio(matrix: sparse.spmatrix) -> float:
-    """Return the largest over the smallest eigenvalue of a symmetric positive definite matrix."""
-    if matrix.shape[0] < 16:
-        values = np.linalg.eigvalsh(matrix.toarray())
-        return float(values[-1] / values[0])
-    start = (
-        np.ones(matrix.shape[0]) + 0.1 * np.arange(matrix.shape[0]) % 0.7
-    )  # fixed start vector, for reproducible results
-    largest = eigsh(matrix, k=1, which="LA", v0=start, return_eigenvectors=False)[0]
-    smallest = eigsh(matrix.tocsc(), k=1, sigma=0.0, which="LM", v0=start, return_eigenvectors=False)[0]
-    return float(largest / smallest)
 
 
 def _solve_coarsely(residual, data, guide, domain, plate: Plate) -> np.ndarray:

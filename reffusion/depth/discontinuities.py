@@ -45,11 +45,11 @@ def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> n
         values = disparity[near] + slopes[0][near] * moved[0] + slopes[1][near] * moved[1]
         difference = np.abs(colors[near] - colors[at][:, None]).max(-1)
         weights = np.exp(-difference / COLOR) * np.where(ramp[near], ON_RAMP, 1.0)
-        found[at] = 1.0 / _weighted_median(values, weights).clip(*limits)
+        found[at] = 1.0 / weighted_median(values, weights).clip(*limits)
     return found
 
 
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return [N], the weighted median of each row of values [N, S], with positive weights [N, S]."""
     order = np.argsort(values, axis=1)
     total = np.cumsum(np.take_along_axis(weights, order, 1), 1)

@@ -11,7 +11,7 @@ from reffusion.depth.solverlog import NO_LOG, SolverLog
 
 
 def align_estimate(
-    view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, settings: CompletionSettings, log: SolverLog = NO_LOG
+    view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, log: SolverLog = NO_LOG
 ) -> tuple[np.ndarray, str]:
     """Return a monocular estimate aligned with the scene, and a description of the error of the fit.
 
@@ -25,7 +25,6 @@ def align_estimate(
         view: The scene's depth and the pixels at which it is known.
         guide: [H, W, 3] the picture, uint8 or in [0, 1].
         estimate: [H, W], disparity up to scale and offset.
-        settings: Settings of alignment and solver.
         log: Records the result of the solver.
 
     Returns:
@@ -38,14 +37,11 @@ def align_estimate(
             grows, or the bilateral solver does not converge.
         ValueError: The estimate is not finite at a known pixel, or shapes differ.
     """
-    fitted = alignment.align(estimate, view.disparity, view.known, robust=settings.robust)
+    fitted = alignment.align(estimate, view.disparity, view.known)
     if fitted.scale <= 0:
         raise geometry.Degenerate("reversed", "the estimate falls where the scene's disparity grows: is it depth?")
     aligned, confidence = fitted.apply(estimate), view.known.astype(np.float64)
-    error = np.abs(view.disparity - aligned)[view.known]
-    if settings.robust and np.median(error) > 0:  # outliers of the alignment must not be spread either
-        confidence[view.known] = alignment.geman_mcclure_weights(error, 1.4826 * np.median(error))
-    refined = bilateral.refine(aligned, view.disparity, confidence, guide, settings.solver, log.log_iteration)
+    refined = bilateral.refine(aligned, view.disparity, confidence, guide, watch=log.log_iteration)
     log.log_result("bilateral", refined, log.iterations)
     misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()
     return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"

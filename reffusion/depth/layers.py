@@ -12,9 +12,9 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.depth.completion import unit_range
-from reffusion.graph_cut import HARD, alpha_expansion, potts_cost
+from reffusion.graph_cut import HARD, alpha_expansion, neighbor_pairs, potts_cost
 
 JUMP = 0.025  # relative disparity step between neighbors that separates two surfaces
 MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are no surfaces
@@ -72,10 +72,8 @@ def label_surfaces(
     index[domain] = np.arange(domain.sum())
     colors = ndimage.gaussian_filter(unit_range(guide), (1, 1, 0))
     cost = COLOR_WEIGHT * _color_cost(colors, surfaces, domain)
-    label, assumed_label = (
-        _at(surfaces, domain) - 1,
-        surfaces_on_planes(disparity, assumed, surfaces, planes)[domain] - 1,
-    )
+    label = surfaces[domain] - 1
+    assumed_label = surfaces_on_planes(disparity, assumed, surfaces, planes)[domain] - 1
     for k in range(count):
         cost[k] += PLANE_PRIOR_COST * ((assumed_label >= 0) & (assumed_label != k)) + HARD * (
             (label >= 0) & (label != k)
@@ -95,25 +93,18 @@ def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarra
     # unknown pixels). It arises where a pattern in the hole has the colors of another surface.
     island = np.zeros_like(missing)
     for surface in range(1, int(surfaces.max()) + 1):
-        component, _ = ndimage.label(labels == surface, np.ones((3, 3)))
-        is_connected = np.isin(component, np.unique(component[surfaces == surface]))
-        island |= (component > 0) & ~is_connected & missing
+        found = labels == surface
+        island |= found & ~ndimage.binary_propagation(found & (surfaces == surface), np.ones((3, 3)), found) & missing
     if not island.any() or island.all():
         return labels
-    nearest = ndimage.distance_transform_edt(island | (labels == 0), return_distances=False, return_indices=True)
-    return np.where(island, labels[tuple(nearest)], labels)
+    return np.where(island, labels[morphology.nearest_known(~island & (labels != 0))], labels)
 
 
 def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs of neighboring pixels, [E, 2], and the cost [E] of giving a pair's pixels different labels."""
     # A pair consists of two numbers of `index`; pixels whose number is -1 take no part.
-    firsts, seconds, apart = [], [], []
-    for offset in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        first, second = _neighbor_pairs(index, offset)
-        firsts, seconds = [*firsts, first], [*seconds, second]
-        apart.append(np.full(len(first), np.hypot(*offset)))
-    pairs, length = np.stack([np.concatenate(firsts), np.concatenate(seconds)], 1), np.concatenate(apart)
-    flat_colors = _at(colors, index >= 0)
+    pairs, length = neighbor_pairs(index)
+    flat_colors = colors[index >= 0]
     steps = ((flat_colors[pairs[:, 0]] - flat_colors[pairs[:, 1]]) ** 2).sum(-1)
     # The cost is low across edges of the picture.
     return pairs, (MIN_EDGE_COST + np.exp(-steps / max(2 * steps.mean(), 1e-12))) / length
@@ -153,23 +144,6 @@ def surfaces_on_planes(
     return labels
 
 
-def _at(values: np.ndarray, domain: np.ndarray) -> np.ndarray:
-    """Return the values [P, ...] at the P pixels of `domain`, bool [H, W], in row-major order."""
-    return values[domain]
-
-
-def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of pixels and of their neighbors at `offset`, (row >= 0, column)."""
-    height, width = index.shape
-    rows_down, right = offset
-    first_column = max(0, -right)
-    first = index[: height - rows_down, first_column : width - max(0, right)]
-    second = index[rows_down:, first_column + right : first_column + right + first.shape[1]]
-    # Pixels without a number have -1.
-    valid = (first >= 0) & (second >= 0)
-    return first[valid], second[valid]
-
-
 def segment_surfaces(
     disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = (), hole: np.ndarray | None = None
 ) -> np.ndarray:
@@ -197,7 +171,9 @@ def segment_surfaces(
     values, plane_index = disparity[known], np.zeros(int(known.sum()), np.int64)
     for k, depth in enumerate(planes, start=1):
         plane_index[(plane_index == 0) & _is_on_plane(disparity, depth)[known]] = k
-    first, second = _smooth_neighbor_pairs(index, values)
+    first, second = neighbor_pairs(index, ((0, 1), (1, 0)))[0].T
+    is_close = np.abs(values[first] - values[second]) < JUMP * np.maximum(values[first], values[second])
+    first, second = first[is_close], second[is_close]  # neighbors without a jump in disparity between them
     link = lambda pairs: sparse.csr_matrix(
         (np.ones(pairs.sum()), (first[pairs], second[pairs])), shape=(len(plane_index),) * 2
     )
@@ -222,16 +198,6 @@ def segment_surfaces(
     result = np.zeros(known.shape, np.int64)
     result[known] = label[piece]
     return result
-
-
-def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of neighboring pixels without a jump in disparity between them."""
-    firsts, seconds = [], []
-    for offset in ((0, 1), (1, 0)):
-        first, second = _neighbor_pairs(index, offset)
-        is_close = np.abs(values[first] - values[second]) < JUMP * np.maximum(values[first], values[second])
-        firsts, seconds = [*firsts, first[is_close]], [*seconds, second[is_close]]
-    return np.concatenate(firsts), np.concatenate(seconds)
 
 
 def _label_foreground(

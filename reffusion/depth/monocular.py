@@ -5,8 +5,6 @@ Preprocessing is written here in plain torch because the image processor of tran
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +14,11 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from reffusion.weights import local
+from reffusion.weights.transformers_model import load_model
 
 # Of the pixels of ImageNet, on which the backbone was trained.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-MODEL_TYPE = "depth_anything"
+MODEL_TYPE = "depth_anything"  # of Depth Anything and Depth Anything V2
 MAX_DEPTH_M = 1e6  # meters: the depth of a metric network is clamped here before it is inverted
 
 
@@ -50,53 +49,19 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
     Raises:
         ValueError: The model is not on this machine, the folder has no model, or the model is of another type.
     """
-    from transformers import AutoConfig, AutoModelForDepthEstimation
-    from transformers.utils import logging as transformers_logging
-
     advice = "Name a local folder, or leave `depth.model` empty: depth is then continued from the surroundings"
     try:
         folder = local.locate(source)
         if folder is None:
             raise ValueError(local.explain_missing(source))
-        if not (folder / "config.json").is_file():
-            raise ValueError(f"{folder} lacks config.json; it must be a transformers model folder")
+        return make_network(load_model(folder, MODEL_TYPE, "AutoModelForDepthEstimation"), device)
     except ValueError as error:
         raise ValueError(f"depth model {error}. {advice}") from None
-    transformers_logging.disable_progress_bar()
-    _check_kind(_load_or_explain(folder, advice, lambda: AutoConfig.from_pretrained(folder)), str(source))
-    model = _load_or_explain(
-        folder, advice, lambda: AutoModelForDepthEstimation.from_pretrained(folder, dtype=torch.float32)
-    )
-    return make_network(model, device)
-
-
-def _load_or_explain(folder: Path, advice: str, load: Callable[[], Any]) -> Any:
-    """Call a loader of transformers, and turn its errors into a ValueError of one line that ends with `advice`."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return load()
-    except (OSError, ValueError) as error:
-        raise ValueError(f"depth model {folder}: {str(error).splitlines()[0]} {advice}") from error
-
-
-def _check_kind(config, name: str) -> None:
-    """Raise ValueError, which names the model, if a configuration of transformers is not for Depth Anything."""
-    if config.model_type != MODEL_TYPE:
-        raise ValueError(
-            f"depth model {name}: a model of type {config.model_type!r}; those of type {MODEL_TYPE!r} are understood "
-            "(Depth Anything, Depth Anything V2)"
-        )
 
 
 def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
-    """Build a DepthNetwork from a model in memory. The model is frozen and moved to `device`.
-
-    Raises:
-        ValueError: The model is of another type.
-    """
+    """Build a DepthNetwork from a Depth Anything model in memory. The model is frozen and moved to `device`."""
     config: Any = model.config
-    _check_kind(config, config.name_or_path)
     model.requires_grad_(False).eval().to(device)
     metric = config.depth_estimation_type == "metric"
     return DepthNetwork(model, config.patch_size, config.backbone_config.image_size, metric)

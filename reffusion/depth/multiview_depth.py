@@ -74,7 +74,7 @@ def estimate_multiview_depth(
     initial = {name: depth for name, depth in found if depth is not None}
     views = [camera for camera in cameras if camera.name in initial]
     planes = {view.name: _refine_planes(view, views, images, initial[view.name], seed) for view in views}
-    depth = {view.name: _depth_of_planes(planes[view.name], view) for view in views}
+    depth = {view.name: 1 / (planes[view.name] * geometry.pixel_rays(view)).sum(-1) for view in views}
     confirmed = {
         view.name: _confirmed_pixels(view, depth, views) & np.logical_not(hidden.get(view.name, False))
         for view in views
@@ -105,11 +105,6 @@ def _refine_planes(
         return patchmatch.tangent_planes(1 / initial, geometry.pixel_rays(view))
     generator = np.random.default_rng(seeding.seed_for(seed, "agreed", view.name))
     return patchmatch.estimate_planes(view, images[view.name], others, initial, generator)
-
-
-def _depth_of_planes(planes: np.ndarray, view: Camera) -> np.ndarray:
-    """Return [H, W] camera z, the depth at which each pixel's ray meets its plane, [H, W, 3]."""
-    return 1 / (planes * geometry.pixel_rays(view)).sum(-1)
 
 
 def _confirmed_pixels(view: Camera, depth: Mapping[str, np.ndarray], views: Sequence[Camera]) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reffusion import geometry
+from reffusion.depth.discontinuities import weighted_median
 from reffusion.types import Camera
 
 MIN_POINTS = 30  # visible points that a view needs
@@ -142,7 +143,7 @@ def interpolate_depth(samples: DepthSamples, camera: Camera, image: np.ndarray) 
     rays, sample_disparity = geometry.pixel_rays(camera).reshape(-1, 3), samples.disparity[index]
     low, high = sample_disparity / MAX_EXTRAPOLATION, sample_disparity * MAX_EXTRAPOLATION
     candidates = np.einsum("pi,pki->pk", rays, samples.planes[index]).clip(low, high)
-    result = _weighted_median(candidates, 1 / (distance**2 + MIN_DISTANCE**2))
+    result = weighted_median(candidates, 1 / (distance**2 + MIN_DISTANCE**2))
     return 1.0 / cv2.medianBlur(result.reshape(height, width).astype(np.float32), MEDIAN_SIZE).astype(np.float64)
 
 
@@ -167,11 +168,3 @@ def _visible_points(
         differences.append(np.abs(image_colors - point_colors).max(1))
     is_visible = ~is_occluded & (np.min(differences, axis=0) <= MAX_COLOR_DIFFERENCE)
     return uv[is_visible], disparity[is_visible], index[is_visible]
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return [N], the weighted median of each row of `values` [N, K], with `weights` [N, K] > 0."""
-    order = np.argsort(values, axis=1)
-    cumulative = np.take_along_axis(weights, order, axis=1).cumsum(1)
-    middle = (cumulative < 0.5 * cumulative[:, -1:]).sum(1, keepdims=True)
-    return np.take_along_axis(np.take_along_axis(values, order, axis=1), middle, axis=1)[:, 0]

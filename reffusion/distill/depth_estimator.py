@@ -41,7 +41,7 @@ def build_estimator(params: Params, points: np.ndarray) -> DepthEstimator:
         ValueError: The network cannot be loaded (see `monocular.load_network`).
     """
     # PAPER leaves open: whether an estimate is aligned by least squares or robustly. Here it is least squares.
-    how = CompletionSettings(robust=False, seed=params.seed)
+    how = CompletionSettings(seed=params.seed)
     if not params.depth.model:
         return continuation_estimator(points, how)
     network = monocular.load_network(params.depth.model, params.device)
@@ -71,6 +71,6 @@ def network_estimator(network: Callable[[Tensor], Tensor], how: CompletionSettin
     def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
-        return estimates.align_estimate(view, painted, estimate, how)[0]
+        return estimates.align_estimate(view, painted, estimate)[0]
 
     return DepthEstimator(how, disparity)

@@ -132,27 +132,26 @@ def binomial_filter(size: int, padding: int) -> Tensor:
     return matrix[:, padding:-padding].contiguous()
 
 
-def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
+def append_minibatch_std(features: Tensor) -> Tensor:
     """Append the minibatch standard deviation as a channel: [B, C, h, w] -> [B, C + 1, h, w].
 
     The channel is constant within a group of patches. Its value is the standard deviation over the group, averaged over
     channels and pixels. By this value the critic recognizes fake patches that are too similar to each other. A group
-    consists of every (B / group)-th patch, so consecutive patches are in different groups (if B > group).
+    consists of every (B / GROUP)-th patch, so consecutive patches are in different groups (if B > GROUP).
 
     Args:
         features: [B, C, h, w].
-        group: Number of patches in a group.
 
     Raises:
-        ValueError: B is no multiple of `group`.
+        ValueError: B is no multiple of `GROUP`.
     """
     batch = len(features)
-    if batch % group:
-        raise ValueError(f"{batch} patches cannot be split into groups of {group}")
-    grouped = features.reshape(group, batch // group, *features.shape[1:])
+    if batch % GROUP:
+        raise ValueError(f"{batch} patches cannot be split into groups of {GROUP}")
+    grouped = features.reshape(GROUP, batch // GROUP, *features.shape[1:])
     # The offset keeps the square root's derivative finite where all patches are equal.
     deviation = (grouped.var(0, unbiased=False) + 1e-8).sqrt().mean((1, 2, 3))
-    return torch.cat([features, deviation.repeat(group)[:, None, None, None].expand_as(features[:, :1])], dim=1)
+    return torch.cat([features, deviation.repeat(GROUP)[:, None, None, None].expand_as(features[:, :1])], dim=1)
 
 
 def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
@@ -174,15 +173,8 @@ def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
     Args:
         fake: Scores of fake patches, of any shape.
         form: One of the two forms.
-
-    Raises:
-        ValueError: `form` is unknown.
     """
-    if form == "saturating":
-        return F.logsigmoid(-fake).mean()
-    if form == "non-saturating":
-        return -F.logsigmoid(fake).mean()
-    raise ValueError(f"the generator's loss must be saturating or non-saturating, got {form!r}")
+    return F.logsigmoid(-fake).mean() if form == "saturating" else -F.logsigmoid(fake).mean()
 
 
 def gradient_penalty(scores: Tensor, patches: Tensor) -> Tensor:

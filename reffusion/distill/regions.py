@@ -11,6 +11,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+RESOLUTION = 32  # number of voxels along the diagonal of the bounding box of the masked Gaussians
+# Number of voxels along each axis by which a masked Gaussian may be away from the nearest masked Gaussian of the
+# initialization.
+REACH = 2
+
 
 @dataclass(frozen=True)
 class VoxelRegion:
@@ -21,7 +26,7 @@ class VoxelRegion:
     Attributes:
         origin: [3], the lowest corner of the grid.
         voxel: Side of a voxel.
-        home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those within `reach` voxels of a masked
+        home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those within `REACH` voxels of a masked
             Gaussian of the initialization (see `build_region`).
         foreign: bool [X, Y, Z], True at voxels in which no unmasked Gaussian may be: those that held a masked Gaussian
             of the initialization, while neither they nor their 26 neighbors held an unmasked one.
@@ -33,7 +38,7 @@ class VoxelRegion:
     foreign: Tensor
 
 
-def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 2) -> VoxelRegion:
+def build_region(means: Tensor, masked: Tensor) -> VoxelRegion:
     """Return the region of the masked Gaussians of an initialization.
 
     PAPER leaves open: the region whose border Gaussians must not cross. The masked Gaussians of the initialization lie
@@ -42,15 +47,12 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
     Args:
         means: [N, 3], the centers of all Gaussians of the initialization.
         masked: bool [N], True for masked Gaussians, of which there is at least one.
-        resolution: Number of voxels along the diagonal of the bounding box of the masked Gaussians.
-        reach: Number of voxels along each axis by which a masked Gaussian may later be away from the nearest masked
-            Gaussian of the initialization.
     """
     masked_means = means[masked]
     low, high = masked_means.amin(0), masked_means.amax(0)
-    voxel = max(float((high - low).norm()) / resolution, 1e-6)
-    origin = low - (reach + 0.5) * voxel
-    shape = [int(n) + 1 for n in ((high - origin) / voxel + reach + 0.5).long()]
+    voxel = max(float((high - low).norm()) / RESOLUTION, 1e-6)
+    origin = low - (REACH + 0.5) * voxel
+    shape = [int(n) + 1 for n in ((high - origin) / voxel + REACH + 0.5).long()]
 
     def voxelize(points: Tensor) -> Tensor:
         grid = torch.zeros(shape, dtype=torch.bool, device=means.device)
@@ -62,7 +64,7 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
         return F.max_pool3d(grid.float()[None], 2 * cells + 1, stride=1, padding=cells)[0] > 0
 
     core, others = voxelize(masked_means), voxelize(means[~masked])
-    return VoxelRegion(origin, voxel, dilate(core, reach), core & ~dilate(others, 1))
+    return VoxelRegion(origin, voxel, dilate(core, REACH), core & ~dilate(others, 1))
 
 
 def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Tensor:

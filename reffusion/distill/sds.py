@@ -8,7 +8,7 @@ sqrt(alpha_bar_t) and s = sqrt(1 - alpha_bar_t).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -106,9 +106,6 @@ def sds_gradient(
 
     Returns:
         [B, C, h, w] without gradient.
-
-    Raises:
-        ValueError: `weighting` is unknown.
     """
     with torch.no_grad():
         alpha_bar = alphas_cumprod[timesteps].reshape(-1, 1, 1, 1)
@@ -124,10 +121,8 @@ def sds_gradient(
             gradient = variance * (eps - noise)
         elif weighting == "alpha_sigma2":
             gradient = signal * variance * (eps - noise)
-        elif weighting == "one":
-            gradient = eps - noise
         else:
-            raise ValueError(f"weighting must be one of {', '.join(get_args(Weighting))}; got {weighting!r}")
+            gradient = eps - noise
         if mask is not None:
             gradient = gradient * mask
         return gradient
@@ -145,15 +140,10 @@ def sds_loss(latents: Tensor, gradient: Tensor, reduction: Literal["sum", "mean"
         latents: [1 + P, C, h, w], differentiable back to the rendering.
         gradient: [1 + P, C, h, w] from `sds_gradient`.
         reduction: Whether the elements of a latent are summed or averaged.
-
-    Raises:
-        ValueError: `reduction` is unknown.
     """
     patches = latents.shape[0] - 1
     share = latents.new_full((latents.shape[0],), 1 / max(patches, 1))
     share[0] = 1
     if reduction == "mean":
         share = share / latents[0].numel()
-    elif reduction != "sum":
-        raise ValueError(f"reduction must be sum or mean, got {reduction!r}")
     return (share * (latents * gradient).flatten(1).sum(1)).sum()

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from reffusion.depth.multiview_depth import estimate_multiview_depth
 from reffusion.depth.sparse_to_dense import NORMAL_NEIGHBORS, SparsePoints
-from reffusion.gaussians.sheets import Sheets, sheet_gaussians
+from reffusion.gaussians.sheets import sheet_gaussians
+from reffusion.gaussians.surfels import is_beside_nearer
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -27,7 +27,6 @@ STEPS_SHARE = 0.2  # of the steps of a normal fit: the surfaces exist already, a
 # A pixel counts as covered if the Gaussians so far have at least this alpha there, and a depth less than this multiple
 # of the pixel's own.
 MIN_ALPHA, OCCLUSION_RATIO = 0.7, 1.05
-NEIGHBORHOOD_PX = 3  # px, side of the square in which nearer surfaces are searched
 
 
 @torch.no_grad()
@@ -69,24 +68,15 @@ def gaussians_on_surfaces(
     ]
     for camera, pixels in passes:
         depth = view_depths[camera.name].depth
-        missing = pixels & ~is_beside_nearer(depth) & np.logical_not(hidden.get(camera.name, False))
+        missing = pixels & ~is_beside_nearer(depth, OCCLUSION_RATIO) & np.logical_not(hidden.get(camera.name, False))
         if result is not None:
             rendering = rasterizer.render(result, camera, sh_degree=0)
             rendered_depth, is_covered = rendering.depth.cpu().numpy(), rendering.alpha.cpu().numpy() >= MIN_ALPHA
             missing &= ~(is_covered & (rendered_depth < OCCLUSION_RATIO * depth))
-        added = sheet_gaussians(images[camera.name], depth, missing, camera, (params.sh.degree + 1) ** 2, Sheets())
+        added = sheet_gaussians(images[camera.name], depth, missing, camera, (params.sh.degree + 1) ** 2)
         added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
         result = added if result is None else result.zip_map(added, lambda a, b: torch.cat([a, b]))
     return result
-
-
-def is_beside_nearer(depth: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
-
-    The color of the nearer surface bleeds into these pixels. Their depth exceeds `OCCLUSION_RATIO` times the smallest
-    depth among the 3 x 3 pixels around them.
-    """
-    return depth > OCCLUSION_RATIO * ndimage.minimum_filter(depth, NEIGHBORHOOD_PX)
 
 
 def shorten_schedule(params: Params) -> Params:

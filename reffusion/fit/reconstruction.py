@@ -25,7 +25,7 @@ from reffusion.fit.step import (
 from reffusion.fit.view_loader import check_sizes, iterate_views, to_tensors
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
-from reffusion.splat.rasterizer import Implementation, render
+from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 PLACED_RATE_FACTOR = 0.1  # factor on the learning rate of positions, for Gaussians whose positions are known
@@ -46,8 +46,6 @@ def fit(
     gains: np.ndarray | None = None,
     placed: Tensor | None = None,
     spent: float = 0.0,
-    impl: Implementation = "auto",
-    label: str = "fit",
 ) -> Gaussians:
     """Optimize the initial Gaussians so that their renderings match the views, and return the result.
 
@@ -72,8 +70,6 @@ def fit(
             `PLACED_RATE_FACTOR` times the learning rate. None: all False.
         spent: seconds already spent on making `initial`; "seconds" in the trace, which is cumulative, starts from this
             value.
-        impl: implementation of the renderer.
-        label: name of the optimization in its progress bar.
 
     Returns:
         The Gaussians, detached. Their number differs from that of `initial` if the schedule densifies or prunes.
@@ -92,16 +88,16 @@ def fit(
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
-    trace_inputs = (held_out, images, settings, impl)
+    trace_inputs = (held_out, images, settings)
     if run.iteration == 0:
         _write_line(log, run, *trace_inputs)
     steps, coarse = range(run.iteration, settings.iterations), coarse_steps(settings)
     for i, (camera, target, counts) in zip(
-        trace.progress(settings.iterations, label, run.iteration),
+        trace.progress(settings.iterations, "fit", run.iteration),
         iterate_views(cameras, images, weights, steps, settings.seed, coarse, optimizer.masked.device),
         strict=True,
     ):
-        run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
+        run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i))
         control_density(optimizer, cameras, run.started_with, settings, run.iteration)
         average(optimizer, settings, run.iteration)
         is_line_due = trace.is_log_step(run.iteration, settings.iterations, first=FIRST_TRACED_STEP)
@@ -205,17 +201,16 @@ def _write_line(
     held_out: Sequence[Camera],
     images: Mapping[str, np.ndarray],
     settings: Params,
-    impl: Implementation,
 ) -> None:
     """Write a line of the trace and reset the sums of `run`; the time of this call does not count in "seconds"."""
     with log.pause():
         end = {"reason": "finished"} if run.iteration == settings.iterations else {}
-        log.log(run.iteration, **_trace_values(run, held_out, images, settings, impl), **end)
+        log.log(run.iteration, **_trace_values(run, held_out, images, settings), **end)
     run.loss, run.error, run.steps = 0.0, 0.0, 0
 
 
 def _trace_values(
-    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: Implementation
+    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params
 ) -> dict[str, Any]:
     """Return a trace line's values: number of Gaussians, loss and PSNR (dB) since the last line, held-out PSNR."""
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
@@ -226,7 +221,7 @@ def _trace_values(
     degree, gaussians = degree_at(settings, run.iteration), run.optimizer.gaussians.map(Tensor.detach)
     psnr = []
     for camera in held_out:
-        image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
+        image = render(gaussians, camera, sh_degree=degree).color.clamp(0, 1)
         _, target, _ = to_tensors(camera, images[camera.name], None, gaussians.means.device)
         psnr.append(trace.decibels(squared_error(image, target, None)))
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}

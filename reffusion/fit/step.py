@@ -14,15 +14,14 @@ from torch import Tensor
 
 from reffusion import seeding
 from reffusion.fit.exposure import Exposures
-from reffusion.gaussians.densify import densify, prune, viewing_distance
+from reffusion.gaussians.densify import PRUNED_OPACITY, SPLIT_SCALE, densify, prune, viewing_distance
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.geometry import cameras_extent
 from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.fit import Densify, LearningRates, Params
-from reffusion.splat.rasterizer import Implementation, render
+from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
 
-PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
 # Learning rates for refining an existing scene. The rates of positions lie between those at the start and at the end of
 # a fit with the profile `laptop`, so that Gaussians which contradict the views can still move.
 REFIT_RATES = Rates(
@@ -30,7 +29,6 @@ REFIT_RATES = Rates(
 )
 COARSE_SHARE = 0.3  # share of the steps, at the start, that use views of half the size
 AVERAGED_FROM = 0.9  # share of the steps after which Gaussians are averaged into the result
-GROW_SCALE3D = 0.01  # size (see `densify.size_unit`) above which a Gaussian is split, not cloned
 
 
 def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
@@ -60,7 +58,6 @@ def step(
     counts: Tensor | None,
     settings: Params,
     i: int,
-    impl: Implementation,
 ) -> tuple[float, float]:
     """Take one optimization step on one view: render the view, compute the loss, and update Gaussians and exposures.
 
@@ -74,7 +71,6 @@ def step(
         counts: [H, W], weights of its pixels; None: all 1.
         settings: parameters of the stage `fit`.
         i: number of the step, from 0.
-        impl: implementation of the renderer.
 
     Returns:
         The reconstruction loss with the weights `counts`, and the unweighted mean squared error of the pixels of
@@ -91,7 +87,7 @@ def step(
     if settings.random_background:
         background = torch.rand(3, generator=seeding.generator(settings.seed, "background", i)).to(target.device)
     degree = degree_at(settings, i)
-    rendering = render(optimizer.gaussians, camera, background=background, impl=impl, sh_degree=degree, probe=probe)
+    rendering = render(optimizer.gaussians, camera, background=background, sh_degree=degree, probe=probe)
     image = rendering.color if exposures is None else exposures.apply(rendering.color, camera.name)
     loss = reconstruction_loss(image, target, counts)
     loss_value = float(loss.detach())
@@ -188,12 +184,12 @@ def control_density(
         generator = seeding.generator(settings.seed, "densify", done)
         max_gaussians = _max_gaussians(started_with, settings, done)
         unit = _size_unit(optimizer.gaussians.means, cameras, schedule)
-        densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * unit, max_gaussians, generator)
+        densify(optimizer, schedule.grow_grad2d, SPLIT_SCALE * unit, max_gaussians, generator)
         unit = _size_unit(optimizer.gaussians.means, cameras, schedule)
         # As in 3DGS, large Gaussians stay until the first reset of opacities: at first they stand for whole surfaces.
-        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * unit if done > period else math.inf)
+        prune(optimizer, PRUNED_OPACITY, schedule.prune_scale3d * unit if done > period else math.inf)
     if period and done % period == 0:
-        optimizer.cap_opacity(0.01)
+        optimizer.cap_opacity()
 
 
 def _size_unit(means: Tensor, cameras: Sequence[Camera], schedule: Densify) -> Tensor | float:

@@ -13,6 +13,8 @@ from torch import Tensor
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.types import Gaussians
 
+PRUNED_OPACITY = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
+SPLIT_SCALE = 0.01  # standard deviation, in a unit of sizes, above which a Gaussian is split, not cloned
 SHRINK = 1.6  # factor by which the standard deviations of the two children of a split are smaller; 0.8 * 2 in 3DGS
 
 

@@ -18,6 +18,7 @@ from reffusion.gaussians import adam
 from reffusion.gaussians.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
 
+OPACITY_CAP = 0.01  # opacity to which `cap_opacity` clamps, as in 3DGS
 DSSIM_SHARE = 0.2  # share of D-SSIM in the reconstruction loss, as in 3DGS
 
 
@@ -274,14 +275,14 @@ class GaussianOptimizer:
             old = getattr(self, name)
             setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
 
-    def cap_opacity(self, limit: float) -> None:
-        """Clamp all opacities to at most `limit` in (0, 1), the opacity reset of 3DGS.
+    def cap_opacity(self) -> None:
+        """Clamp all opacities to at most `OPACITY_CAP`, the opacity reset of 3DGS.
 
         The opacities of Gaussians that the views need grow again in later steps. Adam's moments of the opacity are set
         to zero, because they belong to the former values.
         """
         with torch.no_grad():
-            self.gaussians.opacity_logits.clamp_(max=float(np.log(limit / (1 - limit))))
+            self.gaussians.opacity_logits.clamp_(max=float(np.log(OPACITY_CAP / (1 - OPACITY_CAP))))
             self._first.opacity_logits.zero_()
             self._second.opacity_logits.zero_()
 

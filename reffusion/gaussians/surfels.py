@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -10,6 +11,8 @@ from reffusion.geometry import pixel_rays, unproject
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
+THICKNESS = 0.1  # standard deviation along the normal, divided by the smaller of the two within the surface
+GRAZING = 0.15  # cosine of the angle between normal and viewing direction below which disks are not stretched further
 STEP = 0.02  # change of the disparity's slope per pixel, relative to the disparity, above which a pixel lies at a step
 
 
@@ -21,8 +24,6 @@ def surface_gaussians(
     *,
     sh_count: int,
     spread: float = 0.5,
-    thickness: float = 0.1,
-    grazing: float = 0.15,
     opacity: float = 0.95,
     offset_px: float = 0.0,
 ) -> Gaussians:
@@ -41,8 +42,6 @@ def surface_gaussians(
         camera: the view.
         sh_count: number of spherical harmonics per Gaussian; all but the constant one are 0.
         spread: standard deviation of a disk in pixels of the view.
-        thickness: standard deviation along the normal, divided by the smaller of the two within the surface.
-        grazing: cosine of the angle between normal and viewing direction below which disks are not stretched further.
         opacity: opacity of each disk, in (0, 1).
         offset_px: distance of the disks behind the surface, along its normal, in pixels.
 
@@ -58,10 +57,10 @@ def surface_gaussians(
     points, normals = points[pixels], normals[pixels]
     rays = points - camera.center
     view_directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    cosine = np.clip(-(view_directions * normals).sum(-1), grazing, 1.0)
+    cosine = np.clip(-(view_directions * normals).sum(-1), GRAZING, 1.0)
     axes = _axes(normals, view_directions, camera)
     tangent_scale = spread * depth[pixels] / np.sqrt(camera.fx * camera.fy)
-    scales = np.stack([tangent_scale, tangent_scale / cosine, thickness * tangent_scale], -1)
+    scales = np.stack([tangent_scale, tangent_scale / cosine, THICKNESS * tangent_scale], -1)
     points = points - offset_px / spread * tangent_scale[:, None] * normals
     colors = (image[pixels] / 255.0 if image.dtype == np.uint8 else image[pixels]).astype(np.float64)
     sh = np.zeros((len(points), sh_count, 3))
@@ -106,6 +105,15 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 0, -normal / np.where(length > 0, length, 1.0), (0.0, 0.0, -1.0))
     return normal @ camera.world_to_camera[:3, :3]
+
+
+def is_beside_nearer(depth: np.ndarray, ratio: float) -> np.ndarray:
+    """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
+
+    The color of the nearer surface bleeds into these pixels. Their depth exceeds `ratio` times the smallest depth among
+    the 3 x 3 pixels around them.
+    """
+    return depth > ratio * cv2.erode(depth, np.ones((3, 3)))
 
 
 def one_sided_slope(values: np.ndarray) -> np.ndarray:

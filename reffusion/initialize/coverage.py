@@ -14,20 +14,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import morphology
+from reffusion import geometry, morphology
 from reffusion.background.mirrors import render_mirrors
 from reffusion.background.model import Background
 from reffusion.background.visibility import OPAQUE, DepthView, opaque_depth
+from reffusion.gaussians.surfels import is_beside_nearer
 from reffusion.kernels.compiled import map_in_threads, views_at_once
-from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 
-EDGE = 0.03  # relative difference of depth from which two surfaces are different ones
 NARROW = 0.02  # largest width of a gap that is too narrow to show texture, as a fraction of the image's width
 MAX_ANGLE = 45.0  # degrees: largest angle from the axis of a camera without a photograph to the nearest one with one
 MIN_SHARE = 0.001  # a view is completed only if a larger share of its C is uncovered; neighbors complete the rest
-ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of uncovered pixels are dropped, smaller holes filled
 
 
 def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
@@ -85,7 +83,7 @@ def find_uncovered(
         uncovered = rendering.alpha.cpu().numpy() <= OPAQUE
         if camera.name in mirror_depth:
             uncovered |= _contradicts(mirror_depth[camera.name], rendering, background.unobserved[camera.name])
-        island, gap = ISLAND * camera.width, GAP * camera.width
+        island, gap = morphology.ISLAND * camera.width, morphology.GAP * camera.width
         return morphology.remove_small_parts(mask & uncovered, island, gap) & mask
 
     return dict(
@@ -103,24 +101,8 @@ def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.n
     # The rendering contradicts the image (`image_depth` is its camera z, inf where there is none) where the rendered
     # surface lies behind the image. It also does so where the rendered surface lies in front of the image, no reference
     # added this surface, and the pixel is unobserved: no photograph shows its background.
-    in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
-    return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
-
-
-def find_floaters(
-    gaussians: Gaussians, is_new: Tensor, background: Background, uncovered: Mapping[str, np.ndarray], tau: float
-) -> Tensor:
-    """Return bool [N], the floaters: remaining Gaussians that are visible mostly in uncovered pixels.
-
-    Args:
-        gaussians: the N Gaussians of the draft.
-        is_new: bool [N], True for the Gaussians that references added; these are never floaters.
-        background: the photographs and surfaces around the object.
-        uncovered: view name -> bool [H, W], the result of `find_uncovered`.
-        tau: a Gaussian is a floater if its blending weights in uncovered pixels, summed over the views in `uncovered`,
-            exceed `tau` times those in all other pixels of these views.
-    """
-    return voting.find_floaters(gaussians, background.cameras, uncovered, tau) & ~is_new
+    in_front = (depth < (1 - geometry.OTHER_SURFACE) * image_depth) & ~is_new & unobserved
+    return np.isfinite(image_depth) & (in_front | (image_depth < (1 - geometry.OTHER_SURFACE) * depth))
 
 
 @torch.no_grad()
@@ -202,7 +184,7 @@ def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Referenc
     """
     rendering = rasterizer.render(gaussians, reference.camera, sh_degree=0)
     visible = torch.where(rendering.alpha > 0.5, rendering.depth, torch.inf).double().cpu().numpy()
-    return reference.mask & ~mask & (depth < (1 - EDGE) * visible)
+    return reference.mask & ~mask & (depth < (1 - geometry.OTHER_SURFACE) * visible)
 
 
 def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.ndarray:
@@ -214,5 +196,5 @@ def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.nda
         depth: [H, W], camera z of the surfaces in the completed view.
         remaining_depth: [H, W], camera z of the remaining Gaussians (the scene without the object) in the same view.
     """
-    nearest = cv2.erode(depth, np.ones((3, 3)))
-    return (depth > (1 + EDGE) * nearest) & (np.abs(depth - remaining_depth) < EDGE * remaining_depth)
+    is_remaining = np.abs(depth - remaining_depth) < geometry.OTHER_SURFACE * remaining_depth
+    return is_beside_nearer(depth, 1 + geometry.OTHER_SURFACE) & is_remaining

@@ -19,11 +19,11 @@ from reffusion.initialize.draft import Draft
 from reffusion.initialize.fill import fill_reference
 from reffusion.inpaint import classical, exemplar
 from reffusion.inpaint.classical import Painter
+from reffusion.masks import voting
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.types import Reference
 
-FLOATER_RATIO = 1.0  # ratio of blending weights in uncovered to other pixels above which a Gaussian is a floater
 STUCK = 0.9  # a completed view is not tried again if more than this share of its uncovered pixels remains uncovered
 SEED = 0  # seed of the patch search
 
@@ -33,9 +33,9 @@ def complete_extra_views(
 ) -> tuple[Draft, list[Reference], dict[str, np.ndarray]]:
     """Complete the view with most uncovered pixels, add it to the draft, and repeat, up to `params.extra_views` times.
 
-    Before the first view, floaters are removed (`coverage.find_floaters`). The loop ends early if no view has enough
-    uncovered pixels (`coverage.least_covered_view`). A view whose depth cannot be estimated is left as it is. A line is
-    printed for each view.
+    Before the first view, floaters are removed: remaining Gaussians that are visible mostly in uncovered pixels. The
+    loop ends early if no view has enough uncovered pixels (`coverage.least_covered_view`). A view whose depth cannot be
+    estimated is left as it is. A line is printed for each view.
 
     Args:
         params: parameters of the stage `initialize`.
@@ -57,7 +57,7 @@ def complete_extra_views(
         draft.gaussians, draft.is_new, background, cameras, mirror_depth
     )
     uncovered = find(draft, background.cameras)
-    draft = draft.drop(coverage.find_floaters(draft.gaussians, draft.is_new, background, uncovered, FLOATER_RATIO))
+    draft = draft.drop(voting.find_floaters(draft.gaussians, background.cameras, uncovered) & ~draft.is_new)
     completed = coverage.completed_views(references, draft.gaussians, background)
     sources = replace(background, completed=completed)
     cameras = coverage.cameras_near_photographs(background)

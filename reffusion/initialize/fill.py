@@ -10,11 +10,11 @@ import torch
 
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
+from reffusion.background.visibility import OPAQUE
 from reffusion.depth import billboard, monocular
 from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.discontinuities import beside_steps, sharpen_steps
 from reffusion.depth.monocular import DepthNetwork
-from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, unprojection
 from reffusion.initialize.draft import EXTRA_VIEW, REFERENCE, Draft
 from reffusion.initialize.sharing import Share, share_surfaces
@@ -26,7 +26,6 @@ from reffusion.trace import Trace
 from reffusion.types import Camera, Reference, Rendering
 
 STEPS_MARGIN = 0.006  # of the image's width: how far beyond the hole ramps of the depth are sharpened to steps
-COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
 GAP_ALPHA = 0.5  # the new surface has a gap where another view renders a lower alpha in its C
 COMPLETION = CompletionSettings()
 
@@ -115,7 +114,7 @@ def fill_reference(
         ValueError: as `unprojection.estimate_depth`.
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
-    hole = unprojection.find_hole(draft, reference, mask, COVERED)
+    hole = unprojection.find_hole(draft, reference, mask, OPAQUE)
     if farthest and background.mirrors:
         hole |= reference.mask  # also where the visible surface lies behind a mirror image
     surface = estimate_surface(params, draft, reference, background, hole, disparity, log, farthest)
@@ -131,15 +130,15 @@ def fill_reference(
         pixels |= dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(surface.depth)
     # New Gaussians change color with direction as their surroundings do. An inserted object does not: it has a shine
     # of its own. An extra view is too narrow to show how colors change.
-    sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not inserts)
+    view_dependent = params.view_dependent_color and not farthest and not inserts
     origin = EXTRA_VIEW if farthest else REFERENCE
-    draft = unprojection.add_surface(draft, reference, surface.depth, pixels, background, sheets, origin)
+    draft = unprojection.add_surface(draft, reference, surface.depth, pixels, background, view_dependent, origin)
     if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
         return ReferenceFill(draft, surface.depth)
     views = [(each, background.masks[each.name]) for each in background.cameras]
     gaps = unprojection.find_gaps(draft.gaussians, camera, surface.estimate, mask & ~pixels, views, GAP_ALPHA)
     if gaps.any():
-        draft = unprojection.add_surface(draft, reference, surface.estimate, gaps, background, sheets)
+        draft = unprojection.add_surface(draft, reference, surface.estimate, gaps, background, view_dependent)
     return ReferenceFill(draft, surface.depth)
 
 

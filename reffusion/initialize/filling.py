@@ -16,7 +16,7 @@ from reffusion.background.model import Background
 from reffusion.depth import monocular
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.draft_operations import add_random, refit_draft, restrict_invent_masks
-from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
+from reffusion.initialize.extra_views import complete_extra_views
 from reffusion.initialize.fill import fill_references
 from reffusion.initialize.warped_views import warp_references
 from reffusion.inpaint import feedforward
@@ -76,7 +76,7 @@ def initialize_scene(
     if params.tidy and params.start != "nothing":  # if nothing is filled in, floaters look better than a hole
         train = [space.scene.cameras[name] for name in space.scene.train]
         unobserved = {camera.name: space.mask_sets[camera.name].unobserved for camera in train}
-        draft = draft.drop(voting.find_floaters(draft.gaussians, train, unobserved, FLOATER_RATIO))
+        draft = draft.drop(voting.find_floaters(draft.gaussians, train, unobserved))
     nothing = Filling(draft, len(space.remaining) - len(draft.gaussians))
     if not references:
         return nothing

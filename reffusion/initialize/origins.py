@@ -12,7 +12,7 @@ from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.background.visibility import OPAQUE, is_seen
 from reffusion.initialize.draft import EXTRA_VIEW, REFERENCE, Draft
-from reffusion.morphology import square, to_pixels
+from reffusion.morphology import dilate_square, to_pixels
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, MaskSet, Rendering
 
@@ -108,4 +108,4 @@ def _find_conflicts(rendering: Rendering, camera: Camera, pixels: np.ndarray, ba
         )
         differences[number, seen] = np.abs(color - own[seen]).mean(1)
     found[rows, columns] = (differences > CONFLICT).sum(0) > 0.5 * np.isfinite(differences).sum(0)
-    return cv2.dilate(found.astype(np.uint8), square(STRIDE // 2)).astype(bool) & pixels
+    return dilate_square(found, STRIDE // 2) & pixels

@@ -24,7 +24,6 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
 SAME_NORMAL = 0.85  # smallest cosine between the normals of the same surface in two references
-PAST = 0.03  # relative difference of depth from which a reference sees past a surface that another one shows
 MIN_COSINE = 0.05  # smallest cosine between normal and view that is counted: the footprint stays finite
 UNCHANGED = 12  # levels of 255: largest difference between two pictures that show the same
 EDGE = np.ones((3, 3), np.uint8)  # window of 3 x 3 px, because an edge is located to within a pixel
@@ -180,7 +179,7 @@ def cross_visibility(
     inside &= (z > 0) & (far > 0)
     same_depth = (z > (1 - geometry.SAME_SURFACE) * near) & (z < (1 + geometry.SAME_SURFACE) * far)
     same = inside & covered & same_depth & ((normal * normals).sum(1) > SAME_NORMAL)
-    return same, inside & (z < (1 - PAST) * near), footprint
+    return same, inside & (z < (1 - geometry.OTHER_SURFACE) * near), footprint
 
 
 def unchanged_rim(image: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> np.ndarray:
@@ -196,5 +195,4 @@ def unchanged_rim(image: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> np
     """
     alike = drawn & (np.abs(image.astype(np.int16) - photo).max(-1) <= UNCHANGED)
     alike = ndimage.binary_opening(alike, np.ones((2, 2)))
-    parts, _ = ndimage.label(alike | ~drawn)
-    return alike & np.isin(parts, np.unique(parts[~drawn]))
+    return alike & ndimage.binary_propagation(~drawn, mask=alike | ~drawn)

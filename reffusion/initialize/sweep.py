@@ -106,8 +106,7 @@ def sweep_depth(
 def _smooth_depth(depth: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
     """Return the depth map [H, W] after a median filter of `side` px, with pixels that are not `known` filled first."""
     # Before, each pixel that is not `known` takes the depth of the nearest known pixel.
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return ndimage.median_filter(depth[tuple(nearest)].astype(np.float64), side)
+    return ndimage.median_filter(depth[morphology.nearest_known(known)].astype(np.float64), side)
 
 
 def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthView]) -> list[DepthView]:

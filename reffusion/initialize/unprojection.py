@@ -18,7 +18,7 @@ from reffusion.background.model import Background
 from reffusion.depth import background_depth, estimates
 from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.solverlog import SolverLog
-from reffusion.gaussians.sheets import Sheets, sheet_gaussians
+from reffusion.gaussians.sheets import sheet_gaussians
 from reffusion.initialize.draft import REFERENCE, Draft
 from reffusion.initialize.view_dependent_color import measure_change, transfer_sh
 from reffusion.morphology import square
@@ -26,6 +26,7 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 
+COLOR_STEPS = 5  # number of corrections of the colors
 COLOR_WINDOW_PX = 2  # px: radius of the window whose darkest and brightest colors bound a Gaussian's color
 COLOR_MARGIN = 0.1  # colors in [0, 1]: how far beyond these bounds a Gaussian's color may lie
 
@@ -85,7 +86,7 @@ def estimate_depth(
                 view, reference.image, points, completion, solvers, farthest
             )
         else:
-            solved, words = estimates.align_estimate(view, reference.image, disparity, completion, solvers)
+            solved, words = estimates.align_estimate(view, reference.image, disparity, solvers)
         # A continued disparity may fall to 0 and below, where depth is infinite; so it is limited from below.
         estimate = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
@@ -153,7 +154,7 @@ def add_surface(
     depth: np.ndarray,
     pixels: np.ndarray,
     background: Background,
-    sheets: Sheets,
+    view_dependent: bool,
     origin: int = REFERENCE,
 ) -> Draft:
     """Return the draft with pixels of a reference added, as a surface of new Gaussians.
@@ -166,26 +167,27 @@ def add_surface(
         depth: [H, W], camera z of the surface; positive at `pixels`.
         pixels: bool [H, W], the pixels to add.
         background: the photographs, from which view-dependent color is estimated.
-        sheets: settings of the Gaussians on a surface.
+        view_dependent: whether the colors change with the viewing direction, as those of the surface around the hole do
+            (`reffusion.initialize.view_dependent_color`).
         origin: origin of the new Gaussians, see `draft.Draft`.
     """
     camera = reference.camera
-    added = sheet_gaussians(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
+    added = sheet_gaussians(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1])
     old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)), origin)
     gaussians = draft.gaussians
     is_added = torch.arange(len(gaussians), device=draft.is_new.device) >= old_count
-    if sheets.view_dependent:
+    if view_dependent:
         known = background.photographed_depth(camera)
         hole = pixels | background.masks[camera.name]
         change = measure_change(reference.image, known, hole, camera, background.views, background.photos)
         gaussians = transfer_sh(gaussians, is_added, camera, change, background.views)
-    gaussians = match_colors(gaussians, is_added, reference.image, pixels, camera, sheets.color_steps)
+    gaussians = match_colors(gaussians, is_added, reference.image, pixels, camera)
     return Draft(gaussians, draft.origin)
 
 
 @torch.no_grad()
 def match_colors(
-    gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
+    gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera
 ) -> Gaussians:
     """Return all Gaussians, the colors of the labeled ones corrected so that a rendered view shows a given picture.
 
@@ -200,12 +202,11 @@ def match_colors(
         image: uint8 [H, W, 3], the picture that the view should show.
         pixels: bool [H, W], the pixels at which the picture is compared.
         camera: the view.
-        steps: number of corrections.
     """
     target = torch.from_numpy(image).to(gaussians.means) / 255
     chosen = torch.from_numpy(pixels)[..., None].to(gaussians.means)
     low, high = _color_bounds(gaussians, image, camera)
-    for _ in range(steps):
+    for _ in range(COLOR_STEPS):
         residual = (target - rasterizer.render(gaussians, camera).color) * chosen
         gathered = rasterizer.accumulate(gaussians, camera, torch.cat([residual, chosen], -1))
         visible = labels & (gathered[:, 3] > 1e-3)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from scipy import sparse
@@ -100,10 +99,7 @@ def measure_change(
 
 def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
     """Return the uint8 image in [0, 1], blurred over `known` pixels; `blur` is sigma as a fraction of the width."""
-    sigma, weight = morphology.to_pixels(blur, known.shape[1]), known.astype(np.float32)
-    total = cv2.GaussianBlur(weight, (0, 0), sigma)
-    blurred = cv2.GaussianBlur(image.astype(np.float32) / 255 * weight[..., None], (0, 0), sigma)
-    return blurred / np.maximum(total, 1e-3)[..., None]
+    return morphology.masked_blur(image.astype(np.float32) / 255, known, morphology.to_pixels(blur, known.shape[1]))
 
 
 @torch.no_grad()

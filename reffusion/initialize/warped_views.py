@@ -13,12 +13,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy import ndimage
 
 from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.initialize.draft import Draft
-from reffusion.morphology import to_pixels
+from reffusion.morphology import masked_blur, nearest_known, to_pixels
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Reference
 
@@ -120,10 +119,8 @@ def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) ->
     # The detail is that of the picture. The tone is that of the rendering, because colors change with the direction
     # (`view_dependent_color`).
     difference = 255 * rendering.color.cpu().numpy() - (picture := _sample_area(image, uv, mask))
-    blur = lambda values: cv2.GaussianBlur(values, (0, 0), to_pixels(TONE_BLUR, camera.width))
-    weight = mask.astype(np.float32)[..., None]
-    tone = blur(difference * weight) / np.maximum(blur(weight), 1e-3)[..., None]
-    return Reference(camera, ((picture + tone) * weight).clip(0, 255).round().astype(np.uint8), mask)
+    tone = masked_blur(difference, mask, to_pixels(TONE_BLUR, camera.width))
+    return Reference(camera, ((picture + tone) * mask[..., None]).clip(0, 255).round().astype(np.uint8), mask)
 
 
 def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -160,8 +157,7 @@ def _smallest_scale(uv: np.ndarray) -> np.ndarray:
 def _sample_area(image: np.ndarray, uv: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return [h, w, 3] float32, the mean colors under each pixel of the mask, at the positions `uv` in the picture."""
     # Outside the mask the result is meaningless.
-    nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     size = (FINE * mask.shape[1], FINE * mask.shape[0])
-    fine = cv2.resize(uv[tuple(nearest)] - np.float32(0.5), size, interpolation=cv2.INTER_LINEAR)
+    fine = cv2.resize(uv[nearest_known(mask)] - np.float32(0.5), size, interpolation=cv2.INTER_LINEAR)
     picture = cv2.remap(image.astype(np.float32), fine, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return cv2.resize(picture, mask.shape[::-1], interpolation=cv2.INTER_AREA)

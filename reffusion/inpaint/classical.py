@@ -14,6 +14,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from reffusion.io.images import fitting_size
+
 SIZE_MULTIPLE = 8  # px: LaMa halves an image three times
 FSR_SIDE = 160  # px, longer side to which images are reduced for FSR: larger ones take longer and get no sharper
 TELEA_RADIUS = 5  # px, radius around each pixel from which Telea's method takes colors
@@ -85,8 +87,7 @@ def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """
     if not hole.any():
         return image.copy()
-    factor = min(1.0, FSR_SIDE / max(hole.shape))
-    size = tuple(max(1, round(side * factor)) for side in hole.shape[::-1])
+    size = fitting_size(hole.shape[1], hole.shape[0], FSR_SIDE)
     # Without the weights the zeros in the hole would darken the pixels around it.
     weight = cv2.resize((~hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(blank_hole(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)

@@ -24,6 +24,7 @@ from reffusion.background.visibility import OPAQUE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
 from reffusion.inpaint.source_image import flat_source
 from reffusion.kernels.compiled import map_in_threads
+from reffusion.morphology import label_sizes, nearest_known
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
@@ -98,29 +99,28 @@ class _PlaneMap:
 
 
 @torch.no_grad()
-def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0) -> Gaussians:
+def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
     """Return new Gaussians, float32 on the CPU, that continue the scene's planes beyond the training views.
 
     Args:
         gaussians: the scene.
         cameras: the training views, at least one.
-        seed: seed of the search for planes and patches.
 
     Returns:
         Thin disks of one color each, without the scene's Gaussians; none if no plane reaches the border of the capture.
     """
     extension = gaussians.map(lambda p: p[:0].float().cpu())
     views = [_render(gaussians, camera) for camera in cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))]]
-    samples, pixel_size = _sample(views, seed)
+    samples, pixel_size = _sample(views)
     if not len(samples):
         return extension
     reach = REACH * max(views[0].camera.width, views[0].camera.height) * pixel_size
-    maps = _map_planes(_find_planes(samples, INLIER * pixel_size, seed), samples, pixel_size, reach, views, cameras)
+    maps = _map_planes(_find_planes(samples, INLIER * pixel_size), samples, pixel_size, reach, views, cameras)
     maps = [_mark_targets(each, reach) for each in maps]
     viewpoint = np.mean([camera.center for camera in cameras], axis=0)
     targets = [_visible_target(each, [other for other in maps if other is not each], viewpoint) for each in maps]
     continued = [(each, target) for each, target in zip(maps, targets, strict=True) if target.sum() >= MIN_CELLS]
-    painted = map_in_threads(lambda pair: _paint(*pair, seed), continued)
+    painted = map_in_threads(lambda pair: _paint(*pair), continued)
     for (each, target), colors in zip(continued, painted, strict=True):
         disks = _make_disks(each, target, colors, gaussians)
         extension = extension.zip_map(disks, lambda a, b: torch.cat([a, b]))
@@ -137,9 +137,9 @@ def _render(gaussians: Gaussians, camera: Camera) -> _View:
     return _View(small, depth, smooth_surface(depth, small)[1], color.clip(0, 1))
 
 
-def _sample(views: Sequence[_View], seed: int) -> tuple[np.ndarray, float]:
+def _sample(views: Sequence[_View]) -> tuple[np.ndarray, float]:
     """Return random visible points [S, 3], S may be 0, and the median size of a pixel there, in world units."""
-    generator = np.random.default_rng(seeding.seed_for(seed, "surfaces of the scene"))
+    generator = np.random.default_rng(seeding.seed_for(0, "surfaces of the scene"))
     points, sizes = [np.zeros((0, 3))], [np.zeros(0)]
     for view in views:
         rows, columns = np.nonzero(view.depth > 0)
@@ -151,9 +151,9 @@ def _sample(views: Sequence[_View], seed: int) -> tuple[np.ndarray, float]:
     return np.concatenate(points), float(np.median(found)) if len(found) else 0.0
 
 
-def _find_planes(samples: np.ndarray, inlier: float, seed: int) -> list[tuple[np.ndarray, float]]:
+def _find_planes(samples: np.ndarray, inlier: float) -> list[tuple[np.ndarray, float]]:
     """Find planes by RANSAC, and return the normal [3] and offset of each, about by decreasing number of samples."""
-    generator = np.random.default_rng(seeding.seed_for(seed, "planes of the scene"))
+    generator = np.random.default_rng(seeding.seed_for(0, "planes of the scene"))
     return list(islice(search_planes(samples, inlier, generator, MIN_SHARE * len(samples), claimed=2), MAX_PLANES))
 
 
@@ -244,11 +244,10 @@ def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View
 def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
     """Return the map with the cells into which the plane may go on, up to `reach` from where the capture ends it."""
     seen, outside = plane_map.seen, ~plane_map.in_frame
-    parts, count = ndimage.label(seen)
-    if not count:
+    if not seen.any():
         return plane_map
-    sizes = np.bincount(parts.ravel())[1:]
-    large = np.isin(parts, 1 + np.flatnonzero(sizes >= MAIN * sizes.max()))
+    parts, sizes = label_sizes(seen)
+    large = seen & (sizes >= MAIN * sizes.max())[parts]
     # the capture ends the plane where seen cells meet cells outside all frames
     border = ndimage.binary_dilation(large, iterations=CONTACT) & outside
     areas, area_count = ndimage.label(outside)
@@ -266,16 +265,15 @@ def _visible_target(plane_map: _PlaneMap, others: Sequence[_PlaneMap], viewpoint
     target = plane_map.target.copy()
     for other in others:
         target &= ~other.occludes(plane_map.centers, viewpoint)
-    patches, _ = ndimage.label(target | plane_map.seen)
-    return target & np.isin(patches, np.unique(patches[plane_map.seen]))
+    return target & ndimage.binary_propagation(plane_map.seen, mask=target | plane_map.seen)
 
 
-def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
+def _paint(plane_map: _PlaneMap, target: np.ndarray) -> np.ndarray:
     """Return [n, 3] in [0, 1], the colors of the n target cells, made of patches of the seen cells."""
-    nearest = ndimage.distance_transform_edt(~plane_map.seen, return_distances=False, return_indices=True)
-    image = (255 * plane_map.color[tuple(nearest)]).round().astype(np.uint8)  # the cells around must not be black
+    # the cells around must not be black
+    image = (255 * plane_map.color[nearest_known(plane_map.seen)]).round().astype(np.uint8)
     source = flat_source(image, ~plane_map.seen)
-    return complete(source, target, [source], seed=seed).image[target] / 255
+    return complete(source, target, [source], seed=0).image[target] / 255
 
 
 def _make_disks(plane_map: _PlaneMap, target: np.ndarray, colors: np.ndarray, like: Gaussians) -> Gaussians:

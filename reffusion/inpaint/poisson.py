@@ -10,7 +10,6 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 COLOR_WEIGHT = 0.02  # weight of the pieces' colors; gradients have weight 1. Far from the border the colors win.
-TINY_WEIGHT = 1e-9  # weight of colors with which a hole without known neighbors becomes zero, instead of singular
 
 
 def blend(
@@ -78,20 +77,3 @@ def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.nda
     result = image.copy()
     result[mask] = (picture[mask] + tone).clip(0, 255).round()
     return result
-
-
-def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Interpolate values smoothly across a hole, by the Laplace equation.
-
-    The values are 0 in a part of the hole that touches no pixel of `beside`.
-
-    Args:
-        values: [H, W, 3].
-        hole: bool [H, W], the N pixels to fill, at least one.
-        beside: bool [H, W], the pixels outside the hole whose values are continued into it.
-
-    Returns:
-        [N, 3] float64, the values of the hole's pixels in row-major order.
-    """
-    even = np.zeros(values.shape, np.float32)
-    return blend(values, hole, even, even, even, beside, TINY_WEIGHT)

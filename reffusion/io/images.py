@@ -290,6 +290,12 @@ def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     return mask if size is None else resize_nearest(mask, size)
 
 
+def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Return the (width, height) of a picture reduced so that its longer side is at most `longest`; never enlarged."""
+    factor = min(1.0, longest / max(width, height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resize a picture, uint8 [h, w, 3] or [h, w], to `size`.
 

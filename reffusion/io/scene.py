@@ -7,6 +7,7 @@ several objects), test_masks/<view>.png and fill/<view>.png. Terms of masks are 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -106,6 +107,15 @@ def has_photograph(poses_dir: Path, name: str) -> bool:
     In a scene without photographs no view has one, and later stages use renders of its Gaussians instead.
     """
     return (Path(poses_dir) / "images" / f"{name}.png").exists()
+
+
+def save_warnings(folder: Path, messages: Sequence[str]) -> None:
+    """Print the warnings of a stage, and write them to warnings.json in its folder if there are any."""
+    for line in messages:
+        warnings.warn(line, stacklevel=1)
+    # `make check` reads this file. A run in which the stage is cached prints its warnings again.
+    if messages:
+        save_json(Path(folder) / WARNINGS, list(messages))
 
 
 def load_warnings(folder: Path) -> list[str]:

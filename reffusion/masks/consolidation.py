@@ -24,13 +24,11 @@ from reffusion.background.visibility import opaque_depth
 from reffusion.kernels.compiled import map_in_threads, views_at_once
 from reffusion.masks import regions, voting
 from reffusion.masks.regions import FillRequest, Region
-from reffusion.masks.voting import Votes
 from reffusion.params.masks import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labeled by its position
-ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are removed, smaller holes filled
 
 
 def label_object(
@@ -73,13 +71,8 @@ def label_object(
     labels = voting.label_gaussians(votes, params.tau)
     # Gaussians that hardly any view sees, e.g. inside the object or in the wall behind the object, are labeled by
     # their position. PAPER leaves open: the ratio of votes 0 / 0 of Gaussians that no view sees.
-    unseen = _total(weights) <= (UNSEEN_WEIGHT if params.tidy else 0)
+    unseen = weights.masked + weights.unmasked <= (UNSEEN_WEIGHT if params.tidy else 0)
     return labels | (unseen & voting.hidden_inside(gaussians, cameras, ballots))
-
-
-def _total(votes: Votes) -> Tensor:
-    """Return [N], the sum of the votes of masked and unmasked pixels."""
-    return votes.masked + votes.unmasked
 
 
 def render_consistent_masks(
@@ -112,8 +105,8 @@ def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:
 
     If `params.tidy` is False, the mask is returned unchanged.
     """
-    width = mask.shape[1]
-    return morphology.remove_small_parts(mask, ISLAND * width, GAP * width) if params.tidy else mask
+    island, gap = morphology.ISLAND * mask.shape[1], morphology.GAP * mask.shape[1]
+    return morphology.remove_small_parts(mask, island, gap) if params.tidy else mask
 
 
 def needs_unobserved(params: Params, fill: FillRequest) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Rendering
 
@@ -85,9 +85,7 @@ def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
     return votes.masked > tau * votes.unmasked
 
 
-def find_floaters(
-    remaining: Gaussians, cameras: Sequence[Camera], unobserved: Mapping[str, np.ndarray], tau: float = 1.0
-) -> Tensor:
+def find_floaters(remaining: Gaussians, cameras: Sequence[Camera], unobserved: Mapping[str, np.ndarray]) -> Tensor:
     """Find floaters: Gaussians that contribute mostly to unobserved pixels once the object is removed.
 
     Too few other photographs show the place behind an unobserved pixel. Hardly anything supervised the fit there, so
@@ -98,8 +96,6 @@ def find_floaters(
         remaining: the M Gaussians of the scene without the removed ones.
         cameras: the training views.
         unobserved: view name -> bool [H, W], True at unobserved pixels. A view without an entry does not vote.
-        tau: a Gaussian is a floater if the ratio of its contributions to unobserved pixels and to all other pixels
-            exceeds this.
 
     Returns:
         bool [M], True for floaters; all False if no pixel is unobserved.
@@ -109,7 +105,7 @@ def find_floaters(
     """
     if not any(mask.any() for mask in unobserved.values()):
         return torch.zeros(len(remaining), dtype=torch.bool, device=remaining.means.device)
-    return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"), tau)
+    return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"))
 
 
 def hidden_inside(
@@ -185,11 +181,6 @@ def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | N
         The name; None if no view has pixels to invent.
     """
     sizes = {name: int(invent[name].sum()) for name in names if invent[name].any()}
-    whole = {name: size for name, size in sizes.items() if not _touches_border(invent[name])}
+    whole = {name: size for name, size in sizes.items() if not morphology.touches_border(invent[name])}
     candidates = whole or sizes
     return max(sorted(candidates), key=candidates.__getitem__) if candidates else None
-
-
-def _touches_border(mask: np.ndarray) -> bool:
-    """Return whether a mask, bool [H, W], has a True pixel at the image's border."""
-    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())

@@ -91,19 +91,6 @@ class Lpips(nn.Module):
         pairs = zip(self.activations(images), target, self.linear, strict=True)
         return sum(((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, w in pairs)
 
-    def distance_map(self, images: Tensor, targets: Tensor) -> Tensor:
-        """Return the contribution of each pixel to the LPIPS distance, [B, H, W], whose mean is about the distance.
-
-        The map of each layer is enlarged to the images' size.
-
-        Args:
-            images, targets: [B, 3, H, W] in [-1, 1].
-        """
-        maps = zip(self.activations(images), self.activations(targets), self.linear, strict=True)
-        layers = [((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1, keepdim=True) for a, b, w in maps]
-        size = images.shape[2:]
-        return sum(nn.functional.interpolate(each, size, mode="bilinear", align_corners=False) for each in layers)[:, 0]
-
     def activations(self, images: Tensor) -> list[Tensor]:
         """Return the activations of the five compared layers, normalized over channels in each cell.
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from reffusion.background import training_coverage
-from reffusion.io.images import resize_image, resize_nearest
+from reffusion.io.images import fitting_size, resize_image, resize_nearest
 from reffusion.metrics import consistency, image_metrics, imfine, leftovers
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.lpips import Lpips
@@ -77,9 +77,7 @@ def _score_reduced(
     pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
 ) -> dict[str, Any]:
     """Score the mask's box of pictures (by prefix of the columns), reduced to `longest` px on the larger side."""
-    height, width = mask.shape
-    factor = longest / max(width, height)
-    size = max(1, round(width * factor)), max(1, round(height * factor))
+    size = fitting_size(mask.shape[1], mask.shape[0], longest)
     columns: dict[str, Any] = {"reduced_width": size[0], "reduced_height": size[1]}
     if (box := image_metrics.mask_box(resize_nearest(mask, size[::-1]))) is None:
         return columns

@@ -77,10 +77,6 @@ class AdversarialTerm(Settings):
     """
 
     weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
-    # PAPER leaves open: when the critic starts. It starts at once, since the paper trains with the sum of all terms.
-    start: float = Field(
-        0.0, ge=0, le=1, description="fraction of the run after which the term starts (PAPER leaves open)"
-    )
     # PAPER leaves open: its "all spherical harmonics" may mean all coefficients of masked Gaussians, or those of all
     # Gaussians. The latter can remove the color differences at the mask's border that the section describes.
     reaches: Literal["masked", "all"] = Field(

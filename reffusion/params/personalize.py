@@ -23,10 +23,9 @@ class Lora(Settings):
     rank: int = Field(8, ge=1, description="LoRA rank")
     alpha: float = Field(16, gt=0, description="LoRA alpha; a weight changes by alpha / rank * B A")
     dropout: float = Field(0.1, ge=0, lt=1, description="LoRA dropout")
-    layers: Literal["attention", "qkv", "attention+conv"] = Field(
+    layers: Literal["attention", "attention+conv"] = Field(
         "attention",
-        description="layers with LoRA: attention; qkv, without output projections (code of RealFill); or also "
-        "convolutions and feed-forward layers of the UNet",
+        description="layers with LoRA: attention, or also convolutions and feed-forward layers of the UNet",
     )
 
 
@@ -55,11 +54,6 @@ class TrainingSamples(Settings):
 
     size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
     local_share: float = Field(0.5, ge=0, le=1, description="share of the samples that are local crops")
-    # PAPER leaves open: number and sides of the rectangles. Both choices take those of RealFill; the paper uses only
-    # rectangles.
-    masks: Literal["rectangles", "realfill"] = Field(
-        "rectangles", description="random rectangles; code of RealFill: a tenth of the masks covers everything"
-    )
     # The hole is the mask that is inpainted later. Rectangles leave most of the hole visible, and a short training
     # learns to rely on these visible parts.
     hole_share: float = Field(

@@ -23,7 +23,6 @@ EMPTY_SHARE = 0.1  # of samples get the empty prompt, so that classifier-free gu
 MAX_BORDER = 0.1  # maximum share of height or width that is cropped at each side of a global sample
 RECTANGLE_COUNT = (1, 29)  # minimum and maximum number per mask
 RECTANGLE_SIDE = (0.03, 0.25)  # minimum and maximum side of a rectangle / side of the sample
-WHOLE_SHARE = 0.1  # of masks of the kind `realfill` cover the whole image
 INVERTED_SHARE = 0.5  # of masks cover everything except their rectangles
 
 
@@ -81,25 +80,14 @@ def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
     return 1 - mask if _uniform(0, 1, generator) < INVERTED_SHARE else mask
 
 
-def random_mask(samples: TrainingSamples, size: int, generator: torch.Generator) -> Tensor:
-    """Draw a random mask, [1, size, size] float, 1 = repaint.
-
-    With `samples.masks` = "rectangles" it is a `rectangle_mask`. With "realfill" the share `WHOLE_SHARE` of the masks
-    covers the whole image instead.
-    """
-    if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
-        return torch.ones(1, size, size)
-    return rectangle_mask(size, generator)
-
-
-def crop_border(source: Picture, max_border: float, generator: torch.Generator) -> Picture:
+def crop_border(source: Picture, generator: torch.Generator) -> Picture:
     """Return the picture without a strip of random width at each side.
 
-    A strip takes at most the share `max_border` of the picture's height or width.
+    A strip takes at most the share `MAX_BORDER` of the picture's height or width.
     """
     height, width = source.region.shape
-    top, bottom = (int(_uniform(0, max_border, generator) * height) for _ in range(2))
-    left, right = (int(_uniform(0, max_border, generator) * width) for _ in range(2))
+    top, bottom = (int(_uniform(0, MAX_BORDER, generator) * height) for _ in range(2))
+    left, right = (int(_uniform(0, MAX_BORDER, generator) * width) for _ in range(2))
     rows, columns = slice(top, height - bottom), slice(left, width - right)
     return Picture(source.image[:, rows, columns], source.region[rows, columns])
 
@@ -129,7 +117,7 @@ def draw_samples(
         image, hole, prompt = _sample_of_reference(source, native, size, samples.local_share, generator)
         images.append(image)
         use_hole = hole.any() and not hole.all() and _uniform(0, 1, generator) < samples.hole_share
-        masks.append(hole if use_hole else random_mask(samples, size, generator))
+        masks.append(hole if use_hole else rectangle_mask(size, generator))
         prompts.append(EMPTY if _uniform(0, 1, generator) < EMPTY_SHARE else prompt)
     return Batch(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
 
@@ -141,7 +129,7 @@ def _sample_of_reference(
     if _uniform(0, 1, generator) < local_share:
         image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
     else:
-        whole = crop_border(source, MAX_BORDER, generator)
+        whole = crop_border(source, generator)
         image, hole = two_scales(whole.image, [], native)[0], two_scale_masks(whole.region, [], native)[0]
         prompt = GLOBAL
     if hole.shape[-2:] == (size, size):

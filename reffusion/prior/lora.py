@@ -40,29 +40,20 @@ def attach(
     Args:
         prior: The diffusion prior.
         rank, alpha, dropout: Of every layer. A weight changes by alpha / rank * B A.
-        layers: "attention" (as in the paper), "qkv" (without output projections), or "attention+conv" (also
-            convolutions and feed-forward layers of the UNet).
+        layers: "attention" (as in the paper), or "attention+conv" (also convolutions and feed-forward layers of the
+            UNet).
         seed: Seed of the initial values.
 
     Returns:
         {"unet": parameters, "text": parameters of the text encoders}, float32, requiring gradients.
-
-    Raises:
-        ValueError: `layers` is unknown.
     """
     from peft import LoraConfig
 
-    if layers not in ("attention", "qkv", "attention+conv"):
-        raise ValueError(f"layers must be 'attention', 'qkv' or 'attention+conv', not {layers!r}")
-    targets, text_targets = ATTENTION, TEXT_ATTENTION
-    if layers == "qkv":
-        targets, text_targets = ATTENTION[:-1], TEXT_ATTENTION[:-1]
-    elif layers == "attention+conv":
-        targets = ATTENTION + CONVOLUTIONS
+    targets = ATTENTION + CONVOLUTIONS if layers == "attention+conv" else ATTENTION
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for label, part in _adapted_parts(prior).items():
-            names = targets if label == "unet" else text_targets
+            names = targets if label == "unet" else TEXT_ATTENTION
             # peft annotates lora_alpha as int, and only divides it by the rank.
             adapter = LoraConfig(r=rank, lora_alpha=cast(int, alpha), lora_dropout=dropout, target_modules=list(names))
             part.add_adapter(adapter)

@@ -121,18 +121,11 @@ def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) 
     own = hole_a.pixels & (hole_a.depth > 0)
     points, colors = geometry.unproject(hole_a.depth, hole_a.camera)[own], _smooth_colors(a, hole_a)[own]
     uv, z = geometry.project(points, hole_b.camera)
-    inside, framed = geometry.sample_nearest(hole_b.pixels, uv)
-    depth, _ = geometry.sample_nearest(hole_b.depth, uv)
+    is_shown = geometry.shows_points(np.where(hole_b.pixels, hole_b.depth, 0), uv, z, geometry.SAME_SURFACE)
     # The front and the back of an object are two surfaces, however thin it is.
     normals_a = surface_normals(hole_a.depth, hole_a.camera)[own]
     normals_b, _ = geometry.sample_nearest(surface_normals(hole_b.depth, hole_b.camera), uv)
-    both = (
-        framed
-        & inside
-        & (depth > 0)
-        & (np.abs(z - depth) < geometry.SAME_SURFACE * depth)
-        & ((normals_a * normals_b).sum(-1) > ALIKE)
-    )
+    both = is_shown & ((normals_a * normals_b).sum(-1) > ALIKE)
     if both.sum() < LEAST_PIXELS:
         return None
     other, reach = _smooth_colors(b, hole_b), max(1, round(REACH * hole_b.camera.width))

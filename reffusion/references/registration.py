@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from reffusion.io.images import to_gray
-from reffusion.morphology import square
+from reffusion.morphology import dilate_square, to_pixels
 from reffusion.references import tracks
 from reffusion.references.color import match_colors, recolor
 
@@ -115,7 +115,7 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
         working: px; larger pictures are reduced to this longer side before they are compared. The result is for the
             full size in any case.
     """
-    known = ~_dilate(hidden, MARGIN)
+    known = ~dilate_square(hidden, to_pixels(MARGIN, hidden.shape[1]))
     untouched = known.any() and np.median(np.abs(picture.astype(np.int16) - photo)[known]) <= IDENTICAL
     pair = _Pair.at(picture, photo, known, working)
     best = identity_comparison = pair.judge(IDENTITY)
@@ -323,9 +323,3 @@ def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> n
     source = np.array([in_photo[p.queryIdx].pt for p in pairs]) + 0.5
     target = np.array([in_picture[p.trainIdx].pt for p in pairs]) + 0.5
     return tracks.estimate_affine(source, target, 2.0)
-
-
-def _dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """Return the mask, bool [H, W], dilated by a square whose radius is `fraction` of the width, at least 1 px."""
-    reach = max(1, round(fraction * mask.shape[1]))
-    return cv2.dilate(mask.astype(np.uint8), square(reach)) > 0

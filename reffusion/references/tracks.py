@@ -119,11 +119,9 @@ def track(photo: np.ndarray, picture: np.ndarray, points: np.ndarray) -> Tracks:
 def _least_gradient(gray: np.ndarray) -> np.ndarray:
     """Return [H, W], the gradient along the direction in which it is least, in levels of 255 per px."""
     side = _odd(WINDOW * max(gray.shape) / 2)
-    across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
-    xx, xy, yy = (cv2.blur(each, (side, side)) for each in (across * across, across * down, down * down))
-    # The gradient is the root mean square of the directional derivative in a window around each pixel.
-    least = (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
-    return np.sqrt(np.maximum(least, 0))
+    # The gradient is the root mean square of the directional derivative in a window around each pixel. OpenCV's
+    # derivative of a float picture is twice the gradient.
+    return np.sqrt(np.maximum(cv2.cornerMinEigenVal(gray, side), 0)) / 2
 
 
 def _odd(pixels: float) -> int:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -71,8 +71,7 @@ def find_holes(
     for camera in cameras:
         if not invent[camera.name].any():
             continue
-        factor = min(1.0, SIDE / max(camera.width, camera.height))
-        small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        small = camera.shrunk(SIDE)
         shrunk = lambda mask, least, size=(small.width, small.height): (
             cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > least
         )
@@ -105,7 +104,7 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
         return []
     uncovered, result = np.ones(total, bool), []
     named = [name for name in chosen if name in view_holes]
-    at_border = {name for name in view_holes if _touches_border(view_holes[name])}
+    at_border = {name for name in view_holes if morphology.touches_border(view_holes[name].pixels)}
     groups = [([name], 1, 0.0) for name in named] + [
         (set(view_holes) - at_border, most, LEAST_GAIN),
         (at_border, most, LEAST_GAIN),
@@ -122,11 +121,6 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
     return result
 
 
-def _touches_border(hole: Hole) -> bool:
-    """Return whether the hole touches the border of the picture."""
-    return bool(hole.pixels[[0, -1]].any() or hole.pixels[:, [0, -1]].any())
-
-
 def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
     """Return which of the P pixels to be invented in all views each view covers, name -> bool [P], and P."""
     points = [
@@ -137,9 +131,7 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
     for name, hole in view_holes.items():
         uv, z = geometry.project(everything, hole.camera)
         # A view covers a pixel of another view if its own hole, at the reduced size, shows the same surface point.
-        inside, framed = geometry.sample_nearest(hole.pixels, uv)
-        depth, _ = geometry.sample_nearest(hole.depth, uv)
-        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < geometry.SAME_IF_COARSE * depth)
+        covers[name] = geometry.shows_points(np.where(hole.pixels, hole.depth, 0), uv, z, geometry.SAME_IF_COARSE)
     return covers, len(everything)
 
 

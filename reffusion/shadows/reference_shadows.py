@@ -99,9 +99,7 @@ def detect_shadow(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> 
     differs = ratio > max(LOG_RATIO, NOISE_FACTOR * noise)
     if (differs & ~near).sum() <= MIN_AREA * mask.sum():  # no shadow: differences inside C have other causes
         return np.zeros_like(mask)
-    parts, _ = ndimage.label(differs | near)
-    touching = np.unique(parts[mask])
-    found = differs & np.isin(parts, touching[touching > 0])
+    found = differs & ndimage.binary_propagation(mask & near, mask=differs | near)
     return morphology.dilate(found, PENUMBRA) if found.any() else found
 
 

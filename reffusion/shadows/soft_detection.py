@@ -16,7 +16,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.background.model import Background
 from reffusion.background.plane import Plane
 from reffusion.inpaint.plane_frames import label_planes
@@ -185,13 +185,10 @@ def _make_shadow(
     soft = _smooth_light(brightness, seen, *SOFT)
     tint = soft[region].mean(0)
     mean = GAIN * np.minimum(soft.mean(2), 0)
-    parts, _ = ndimage.label(mean < -EDGE)
-    whole = np.isin(parts, np.unique(parts[region & (mean < -EDGE)]))
-    mean = np.where(whole, mean, 0)
+    dark = mean < -EDGE
+    mean = np.where(ndimage.binary_propagation(region & dark, mask=dark), mean, 0)
     # Cells that no photograph shows take the value of the nearest cell that one shows.
-    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    mean = mean[morphology.nearest_known(seen)]
     foot = background.center - (background.center @ plane.normal - plane.offset) * plane.normal
     fade = np.array(FADE) * background.radius
-    return SoftShadow(
-        plane.normal, foot, plane.axes, CELL * background.radius, fade, mean[tuple(nearest)], tint / tint.mean()
-    )
+    return SoftShadow(plane.normal, foot, plane.axes, CELL * background.radius, fade, mean, tint / tint.mean())

@@ -7,21 +7,13 @@ from reffusion.weights import local, painters
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Return the weights that the stage uses, each with what prevents its use on this machine (None if nothing).
-
-    Args:
-        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
-    """
+    """Return the weights that the stage uses, each with what prevents its use on this machine (None if nothing)."""
     painting = painters.weights_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
     return [local.lpips_need(), *painting]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
-
-    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if nothing
-    is inpainted in 2D, or if the parameters name an inpainter that has no file.
-    """
+    """Return the facts of `painters.inpainter_facts`; no facts if nothing is inpainted in 2D."""
     return painters.inpainter_facts(params.inpainter) if params.inpaint else {}
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from reffusion.params.fit import Params
 
-__all__ = ["Params", "preview"]
-
 
 def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str]:
     """Say if the stage takes over Gaussians that the scene brings; an empty list if it fits Gaussians.

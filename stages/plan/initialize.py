@@ -8,15 +8,9 @@ from reffusion.params.initialize import Params
 from reffusion.weights import local, painters
 from reffusion.weights.published import DEPTH_ANYTHING, PAINTERS
 
-__all__ = ["Params", "needed_weights", "preview"]
-
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
-
-    Args:
-        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
-    """
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing)."""
     needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
     return needs + (painters.weights_needs(params.inpainter, "initialize.inpainter") if params.extra_views else [])
 
@@ -27,11 +21,7 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
-
-    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if no extra
-    views are completed, or if the parameters name an inpainter that has no file.
-    """
+    """Return the facts of `painters.inpainter_facts`; no facts if no extra views are completed."""
     return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 
 

@@ -7,20 +7,12 @@ from reffusion.weights import local, painters
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
-
-    Args:
-        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
-    """
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing)."""
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, "float32")]
     return painters.weights_needs(params.inpainter, "lift.inpainter")
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
-
-    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
-    parameters name an inpainter that has no file, such as the diffusion prior.
-    """
+    """Return the facts of `painters.inpainter_facts`."""
     return painters.inpainter_facts(params.inpainter)

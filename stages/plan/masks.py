@@ -6,15 +6,9 @@ from reffusion.params.masks import Params
 from reffusion.weights import local
 from reffusion.weights.segmenters import AUTO, NONE, segmenter_facts
 
-__all__ = ["Params", "needed_weights", "optional_weights", "preview"]
-
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Return the segmentation network that refines masks, if the parameters ask for it; else an empty list.
-
-    Args:
-        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
-    """
+    """Return the segmentation network that refines masks, if the parameters ask for it; else an empty list."""
     return [local.segmenter_need()] if params.segmenter == AUTO and params.refine else []
 
 

@@ -40,11 +40,7 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of its files.
-
-    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
-    parameters name an inpainter that has no file of its own, such as the diffusion prior.
-    """
+    """Return the facts of `painters.reference_facts`."""
     return painters.reference_facts(params.inpainter)
 
 
@@ -85,8 +81,9 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
         has_effect = params.prompt or not params.sampler.guidance
         return [] if has_effect else ["reference.prompt is empty: reference.sampler.guidance has no effect"]
     if params.inpainter.kind in SEED_KINDS:
-        unread = params.prompt and (params.inpainter.kind == "moebius" or _is_blind(params.inpainter.command))
-        note = f"; the prompt '{params.prompt}' is not read" if unread else ""
+        command = params.inpainter.command
+        is_blind = params.inpainter.kind == "moebius" or (command is not None and "{prompt}" not in command)
+        note = f"; the prompt '{params.prompt}' is not read" if params.prompt and is_blind else ""
         name, count = painters.name_seed_painter(params.inpainter), len(params.candidate_numbers)
         return [f"paints the reference by {name}, {count} candidate{'s' if count > 1 else ''}{note}"]
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
@@ -94,8 +91,3 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if (kind := painters.resolve_inpainter(params.inpainter).kind) in PAINTERS:
         how = f"completes the reference by {PAINTERS[kind].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
-
-
-def _is_blind(command: str | None) -> bool:
-    """Return whether a command takes no prompt; False without a command."""
-    return command is not None and "{prompt}" not in command

@@ -23,9 +23,9 @@ from reffusion.types import Gaussians, Rendering
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the adversarial term with its critic. Return None if its weight is 0 or no view has a hole.
 
-    The term begins at the share `adversarial.start` of the run. In each step the real patches come from one reference
-    and the fake ones from one training view. The gradient reaches the spherical harmonics of the masked Gaussians, or
-    with `adversarial.reaches: all` or `confined: false` those of all Gaussians.
+    In each step the real patches come from one reference and the fake ones from one training view. The gradient reaches
+    the spherical harmonics of the masked Gaussians, or with `adversarial.reaches: all` or `confined: false` those of
+    all Gaussians.
 
     Raises:
         ValueError: No reference has a hole.
@@ -47,7 +47,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     return Term(
         "adversarial",
         weight=adversarial.weight,
-        select_view=lambda step: None if step < adversarial.start * settings.iterations else next_view(step),
+        select_view=next_view,
         reaches=reach_hole(settings, everywhere=adversarial.reaches == "all"),
         loss=loss,
         uses_one_thread=True,

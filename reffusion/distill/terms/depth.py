@@ -163,10 +163,7 @@ def _downscale(view: TrainView, max_side: int) -> tuple[Camera, Tensor, Tensor]:
     """Return camera, hole and hidden pixels (bool [H, W] each) of a view whose longer side is at most `max_side` px."""
     # The photograph may not supervise hidden pixels.
     camera, hole, hidden = view.camera, view.repaint, ~view.supervises
-    factor = max_side / max(camera.width, camera.height)
-    if factor >= 1:
-        return camera, hole, hidden
-    small = camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
+    small = camera.shrunk(max_side)
     rows = (torch.arange(small.height, device=hole.device) + 0.5) * camera.height / small.height
     columns = (torch.arange(small.width, device=hole.device) + 0.5) * camera.width / small.width
     pixels = rows.long()[:, None], columns.long()[None]

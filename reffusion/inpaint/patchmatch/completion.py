@@ -24,6 +24,7 @@ from reffusion.inpaint.plane_frames import invert_2x2
 from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.source_image import SourceImage
 from reffusion.io.images import to_gray
+from reffusion.morphology import nearest_known
 
 COARSEST_WIDTH = 40.0  # px, largest width of the hole at the coarsest level, where its content is laid out
 SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
@@ -142,8 +143,7 @@ def _build_pyramid(
 def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
     """Return colors and roughness along x and y, float32 [H, W, 5]; masked pixels take the nearest color."""
     if masked.any() and not masked.all():
-        nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
-        image = image[tuple(nearest)]
+        image = image[nearest_known(~masked)]
     gray = to_gray(image)
     known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
     window = (ROUGHNESS_WINDOW, ROUGHNESS_WINDOW)

@@ -12,15 +12,19 @@ in which candidates are compared with the known picture.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
+from reffusion.graph_cut import neighbor_pairs
 from reffusion.inpaint.poisson import blend
-from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features, neighbor_pairs
+from reffusion.inpaint.shift_map.expansion import choose_candidates, feature_distance, features
 from reffusion.inpaint.source_image import SourceImage
+from reffusion.morphology import masked_blur, nearest_known
+
+if TYPE_CHECKING:
+    from reffusion.inpaint.shift_map.plane_motions import PlaneMotions
 
 RING = 6  # px, width of the ring
 MAX_PIXELS = 15000  # pixels of the graph cut: in a larger hole only every second, third, ... row and column takes part
@@ -82,18 +86,6 @@ class Samples:
     valid: np.ndarray
 
 
-class Candidates(Protocol):
-    """Photographs laid over the hole, one for each of K motions; candidate k is the k-th of them."""
-
-    def __len__(self) -> int: ...
-
-    def sample(self, k: int, pixels: HolePixels) -> Samples:
-        """Return the appearance of candidate k at the pixels."""
-
-    def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
-        """Return [N], the cost of each pixel if candidate k fills it; `INVALID_COST` where it must not."""
-
-
 @dataclass(frozen=True)
 class Assembly:
     """A picture whose hole is filled from pieces, as far as they suit.
@@ -117,9 +109,8 @@ def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.
         image: uint8 [H, W, 3].
         masked: bool [H, W], pixels that do not count in the mean.
     """
-    known, colors = (~masked).astype(np.float32)[..., None], image.astype(np.float32)
-    blur = lambda a: cv2.GaussianBlur(a, (0, 0), DETAIL_SIGMA * image.shape[1]).reshape(*a.shape[:2], -1)
-    return colors, colors - blur(colors * known) / np.maximum(blur(known), 1e-3)
+    colors = image.astype(np.float32)
+    return colors, colors - masked_blur(colors, ~masked, DETAIL_SIGMA * image.shape[1])
 
 
 def erode_readable(source: SourceImage, masked: np.ndarray) -> np.ndarray:
@@ -156,7 +147,7 @@ def assemble(
     target: SourceImage,
     hole: np.ndarray,
     pixels: HolePixels,
-    candidates: Candidates,
+    candidates: PlaneMotions,
     region: np.ndarray,
 ) -> Assembly:
     """Fill the hole of the target from the candidates.
@@ -172,12 +163,11 @@ def assemble(
     labels = _choose(coarse, candidates, hole.shape, stride)
     grid = np.full(hole.shape, -1)
     grid[coarse.rows, coarse.columns] = labels
-    nearest = ndimage.distance_transform_edt(grid < 0, return_distances=False, return_indices=True)
-    labels = grid[tuple(nearest[:, pixels.rows, pixels.columns])]
+    labels = grid[nearest_known(grid >= 0)][pixels.rows, pixels.columns]
     return Assembly(*_blend(target, hole, pixels, labels, candidates, region))
 
 
-def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int) -> np.ndarray:
+def _choose(pixels: HolePixels, candidates: PlaneMotions, shape: tuple[int, int], stride: int) -> np.ndarray:
     """Return each pixel's candidate, chosen by a graph cut."""
     grid = pixels.rows, pixels.columns
     costs, looks = [], []
@@ -189,7 +179,10 @@ def _choose(pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], 
     known = features(*grid, pixels.colors, pixels.detail, shape, stride)
     off = np.minimum(feature_distance(look, known), 2 * MAX_DIFFERENCE)
     cost += np.where(pixels.in_hole | (cost >= INVALID_COST), 0, off)
-    return choose_candidates(cost, look, neighbor_pairs(*grid, shape, stride))
+    index = np.full(shape, -1)
+    index[grid] = np.arange(len(pixels))
+    pairs, _ = neighbor_pairs(index, ((0, stride), (stride, 0)))
+    return choose_candidates(cost, look, pairs)
 
 
 def _blend(
@@ -197,7 +190,7 @@ def _blend(
     hole: np.ndarray,
     pixels: HolePixels,
     labels: np.ndarray,
-    candidates: Candidates,
+    candidates: PlaneMotions,
     region: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the picture with the chosen pieces blended by their gradients, and the pixels that were filled."""

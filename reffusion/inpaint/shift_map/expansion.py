@@ -47,21 +47,6 @@ def feature_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.linalg.norm(first - second, axis=-1) / np.sqrt(3)
 
 
-def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
-    """Return [E, 2], all pairs of horizontal or vertical neighbors on a grid, as indices into the N pixels.
-
-    Args:
-        rows, columns: [N], positions of the pixels.
-        shape: height and width of the picture.
-        stride: px, the spacing of the grid.
-    """
-    index = np.full(shape, -1)
-    index[rows, columns] = np.arange(len(rows))
-    sides = ((index[:, :-stride], index[:, stride:]), (index[:-stride], index[stride:]))
-    pairs = np.concatenate([np.stack([first.ravel(), second.ravel()], 1) for first, second in sides])
-    return pairs[(pairs >= 0).all(1)]
-
-
 def choose_candidates(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Choose one of L candidates for each of N pixels, so that the total cost is low.
 

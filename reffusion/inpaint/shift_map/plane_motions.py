@@ -8,7 +8,7 @@ the strip of known pixels around the hole, in which candidates are compared with
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -140,10 +140,6 @@ class PlaneMotions:
     symmetry: PlaneSymmetry
     motions: Sequence[Motion]
 
-    def with_motions(self, motions: Sequence[Motion]) -> PlaneMotions:
-        """Return the candidates with `motions` in place of the present ones."""
-        return PlaneMotions(self.target, self.photos, self.symmetry, motions)
-
     def __len__(self) -> int:
         return len(self.motions)
 
@@ -223,7 +219,7 @@ def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotion
     # each motion may match another part of the ring
     motions = _best_motions(ring, motions, candidates, 2 * MAX_CANDIDATES)
     motions = [_refine_motion(ring, motion, candidates) for motion in motions]
-    return candidates.with_motions(_best_motions(ring, motions, candidates, MAX_CANDIDATES))
+    return replace(candidates, motions=_best_motions(ring, motions, candidates, MAX_CANDIDATES))
 
 
 def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -> Motion:
