@@ -27,26 +27,39 @@ class Strict(BaseModel, extra="forbid", frozen=True):
     """Base class of the parts of pipeline.yaml, in which unknown keys are errors."""
 
 
-class Condition(Strict):
+class ByParameters(Strict):
+    """What pipeline.yaml says for certain values of parameters only.
+
+    Attributes:
+        param: <stage>.<name>, or several such names, of any stages; these parameters must equal `equals`.
+        equals: see `param`.
+        only: <stage>.<name> -> the value that this parameter must have.
+    """
+
+    param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
+    equals: Any = None
+    only: dict[str, Any] = {}
+
+    @property
+    def expected(self) -> dict[str, Any]:
+        """The parameters, <stage>.<name>, that must have certain values, with these values."""
+        return self.only | dict.fromkeys(self.param, self.equals)
+
+
+class Condition(ByParameters):
     """A condition under which a stage is skipped. It tests exactly one of `fact`, `param` and `empty`.
 
     Attributes:
         reason: why the stage is skipped, for the user; may name facts of the tested stage in braces.
         fact: <stage>.<name>; true if this value of an earlier stage's facts.json equals `equals`.
-        param: <stage>.<name>, or several such names; true if all these parameters, of any stages, equal `equals`.
-        equals: see `fact` and `param`.
         empty: <stage>/<folder>; true if this folder of an earlier stage's artifact has no files.
         unless: the condition is false if scene.yaml has one of these keys.
-        only: <stage>.<name> -> value; the condition is false unless each of these parameters has its value.
     """
 
     reason: str
     fact: str | None = None
-    param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
-    equals: Any = None
     empty: str | None = None
     unless: tuple[str, ...] = ()
-    only: dict[str, Any] = {}
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
@@ -56,18 +69,13 @@ class Condition(Strict):
         return self
 
     @property
-    def expected(self) -> dict[str, Any]:
-        """The parameters, <stage>.<name>, that must have certain values if the condition is true, with these values."""
-        return self.only | dict.fromkeys(self.param, self.equals)
-
-    @property
     def names(self) -> tuple[str, str]:
         """The stage that the condition tests, and the name of the (first) fact, parameter or folder."""
         stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
 
 
-class Substitute(Strict):
+class Substitute(ByParameters):
     """The replacement of a stage by a file that the scene brings.
 
     If scene.yaml has the key `by`, the artifact of the earlier stage `artifact` is used instead of the stage's own.
@@ -75,26 +83,10 @@ class Substitute(Strict):
     Attributes:
         by: key of scene.yaml.
         artifact: name of the earlier stage.
-        param: a parameter `<stage>.<name>`; the stage is only replaced while this parameter equals `equals`. None:
-            always.
-        equals: see `param`.
     """
 
     by: str
     artifact: str
-    param: str | None = None
-    equals: Any = None
-
-
-class IgnoredNeed(Strict):
-    """An optional need that a stage does not read while the parameter `param`, `<stage>.<name>`, equals `equals`.
-
-    The stage then gets None instead of the need's folder, and does not run again when the need changes.
-    """
-
-    need: str
-    param: str
-    equals: Any
 
 
 class Stage(Strict):
@@ -105,7 +97,8 @@ class Stage(Strict):
             is skipped, the stage is skipped too.
         optional: further needs that may be skipped; the stage then gets None instead of a folder.
         provided: the file of the scene that may replace the stage.
-        ignore: an optional need that the stage does not always read.
+        ignore: optional need -> parameters with values, as in `only`. While all have these values, the stage does not read
+            the need: it gets None, and does not run again when the need changes.
         skip_if: the stage is skipped if one of these conditions is true.
         export: folders of the artifact that are copied to runs/<scene>/, where people work with the files.
         params: defaults of the stage's parameters, below those of profiles.
@@ -114,7 +107,7 @@ class Stage(Strict):
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
     provided: Substitute | None = None
-    ignore: IgnoredNeed | None = None
+    ignore: dict[str, dict[str, Any]] = {}
     skip_if: tuple[Condition, ...] = ()
     export: tuple[str, ...] = ()
     params: dict[str, Any] = {}
@@ -129,7 +122,7 @@ class Stage(Strict):
         """All needs, and the stages that must be done before a condition can be tested or the stage be replaced."""
         tested = (condition.names[0] for condition in self.skip_if if not condition.param)
         replaced = [self.provided.artifact] if self.provided else []
-        return (*self.all_needs, *tested, *replaced, *([self.ignore.need] if self.ignore else []))
+        return (*self.all_needs, *tested, *replaced, *self.ignore)
 
 
 class Memory(Strict):

@@ -4,7 +4,7 @@ Terms are explained in `runner`. This module imports nothing heavy.
 """
 
 import json
-import string
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,7 +73,7 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
     if stage in job.broken:
         raise Refused(job.broken[stage])
     own = spec.provided
-    if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
+    if own and own.by in job.brings and _have_values(job, own.expected):
         source = earlier[own.artifact]
         return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
     open_questions: list[str] = []
@@ -98,20 +98,15 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """Return the names of a stage's needs, `scene` included, without the need that the parameters say to ignore.
-
-    For the ignored need see `pipeline.IgnoredNeed`.
-    """
+    """Return the names of a stage's needs, `scene` included, without those that the parameters say to ignore."""
     spec = job.pipeline.stages[stage]
-    ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
-    return [need for need in spec.all_needs if need != ignored]
+    return [need for need in spec.all_needs if need not in spec.ignore or not _have_values(job, spec.ignore[need])]
 
 
 def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Evaluate a condition of pipeline.yaml; None if an earlier stage must run before the answer is known."""
     stage, name = condition.names
-    expected = condition.expected.items()
-    if job.brings.intersection(condition.unless) or not all(_has_value(job, *each) for each in expected):
+    if job.brings.intersection(condition.unless) or not _have_values(job, condition.expected):
         return False
     if condition.param:
         return True
@@ -135,17 +130,16 @@ def _fact(folder: Path, name: str) -> Any:
 
 def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
     """Return a condition's reason, in which the names of facts in braces are replaced by their values."""
-    names = [name for _, name, _, _ in string.Formatter().parse(condition.reason) if name]
-    folder = earlier[condition.names[0]].path if names else None
-    return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
+    value = lambda name: str(_fact(earlier[condition.names[0]].path, name[1]))
+    return re.sub(r"{(\w+)}", value, condition.reason)
 
 
-def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
-    """Return whether the parameter `<stage>.<name>` has this value. Raises Refused if there is no such parameter."""
+def _have_values(job: ResolvedJob, expected: dict[str, Any]) -> bool:
+    """Return whether all parameters `<stage>.<name>` have these values. Raises Refused if one does not exist."""
     params = flatten_params(job.params)
-    if param not in params:
-        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
-    return params[param] == value
+    for name in (name for name in expected if name not in params):
+        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {name}, which is not there")
+    return expected.items() <= params.items()
 
 
 def _receipts(job: ResolvedJob, stage: str) -> dict[Path, dict[str, Any]]:
