@@ -45,7 +45,7 @@ def list_files(folder: Path) -> Iterator[Path]:
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.writing")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.writing")  # runners of other scenes may write it, too
     try:
         partial.write_text(text, encoding="utf-8")
         os.replace(partial, path)
@@ -138,17 +138,14 @@ def lock_holder(runs: Path, name: str) -> tuple[str, str] | None:
 
     Shared holders are not seen, because they do not write into the lock's file.
     """
-    try:
-        with open(runs / ".locks" / name) as file:
-            holder = _holder(file.fileno())
-            if not holder[0]:
-                return None
-            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)  # succeeds if the holder was killed
-            return None
-    except BlockingIOError:
-        return holder
-    except OSError:
-        return None
+    with suppress(OSError), open(runs / ".locks" / name) as file:
+        holder = _holder(file.fileno())
+        try:
+            if holder[0]:
+                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)  # succeeds if the holder was killed
+        except BlockingIOError:
+            return holder
+    return None
 
 
 def _holder(lock: int) -> tuple[str, str]:

@@ -36,7 +36,7 @@ def _hash_content(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
-def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
+def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = ()) -> str:
     """Hash a listing of files to one hash, which depends on the order of the listing, too.
 
     Args:
@@ -114,21 +114,16 @@ class Hashes:
 
     def listing(self, folder: Path, files: Iterable[Path] | None = None) -> dict[str, str]:
         """Return name relative to `folder` -> hash of `files`; None for all files below it without hidden ones."""
-        top = os.path.join(folder, "")
-        name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
-        return {name(str(path)): self.file(path) for path in (list_files(folder) if files is None else files)}
-
-    def files(self, folder: Path, files: Iterable[Path]) -> str:
-        """Return one hash of the contents of `files` and of their names relative to `folder`, in the given order."""
-        return hash_listing(self.listing(folder, files), exclude=())
+        chosen = list_files(folder) if files is None else files
+        return {os.path.relpath(path, folder): self.file(path) for path in chosen}
 
     def weights(self, folder: Path) -> str:
         """Return the hash of a file of weights, or of the folder of a model.
 
         The model's card, pictures and scripts in the folder are left out, so that editing them reruns no stage.
         """
-        read = [path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS]
-        return self.file(folder) if folder.is_file() else self.files(folder, read)
+        read = (path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS)
+        return self.file(folder) if folder.is_file() else hash_listing(self.listing(folder, read))
 
     def save(self) -> None:
         """Write the cache to its file, unless it has no new entries."""
@@ -137,9 +132,7 @@ class Hashes:
         kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
         # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
         with suppress(OSError), self._saving:
-            partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
-            write_text(partial, json.dumps(kept))
-            os.replace(partial, self.path)
+            write_text(self.path, json.dumps(kept))
             self._saved = len(self.known)
 
 

@@ -163,7 +163,7 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
     hashes |= {f"machine: {name}": fact for name, fact in own.machine.items()}
     if own.reads is not None:
-        hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
+        hashes[SCENE] = keys.hash_listing(job.hashes.listing(job.folder, map(Path, own.reads)))
     elif SCENE in job.pipeline.stages[stage].all_needs:
         hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
         for path in job.paths_outside(stage):
