@@ -1,7 +1,7 @@
 """The process that imports stages, started as `python -m runner.worker <command>`.
 
-The command is `describe` (answers questions about stages), `frames` (extracts the frames of a video) or `run` (runs a
-stage). Input is read from the standard input.
+The command is `describe` (answers questions about stages) or `run` (runs a stage). Input is read from the standard
+input.
 
 The description of a stage is a module with the class Params and optional functions (needed_weights, unavailable,
 optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
@@ -153,21 +153,6 @@ def _error(error: Any, model: type[BaseModel], known: list[str]) -> dict[str, An
     return {"where": where, "unknown": unknown, "value": reprlib.repr(value), "message": message}
 
 
-def frames() -> int:
-    """Extract the frames of a video. Prints a sentence about the result or the error, and returns the exit code.
-
-    Reads a JSON object: {"video": path, "folder": path of the folder to fill, "content": hash of the video}.
-    """
-    question = json.load(sys.stdin)
-    video = importlib.import_module("reffusion.capture.video_frames")
-    try:
-        print(video.extract_frames(Path(question["video"]), Path(question["folder"]), question["content"]))
-    except ValueError as error:
-        print(format_error(error))
-        return 1
-    return 0
-
-
 def run() -> int:
     """Run a stage, and return the exit code.
 
@@ -252,10 +237,11 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    code = {"describe": describe, "frames": frames, "run": run}[sys.argv[1]]()
-    if sys.argv[1] == "run":
+    if sys.argv[1] == "describe":
+        describe()
+    else:
+        code = run()
         # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code or 0)
-    sys.exit(code)
+        os._exit(code)
