@@ -3,8 +3,8 @@
 Parameters are named `<stage>.<name>` here, with dots for groups, such as `distill.sds.weight`.
 """
 
-import difflib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, NonNegativeFloat, PositiveFloat
 
 from reffusion.command import scene_name, scene_path, workplace
 from runner import Refused
+from runner.text import unknown_name
 from runner.user_yaml import read_user_yaml
 
 SCENE = "scene"  # the need that stands for the scene's own folder
@@ -97,11 +98,10 @@ class Stage(Strict):
             is skipped, the stage is skipped too.
         optional: further needs that may be skipped; the stage then gets None instead of a folder.
         provided: the file of the scene that may replace the stage.
-        ignore: optional need -> parameters with values, as in `only`. While all have these values, the stage does not read
-            the need: it gets None, and does not run again when the need changes.
+        ignore: optional need -> parameters with values, as in `only`. While all have these values, the stage does not
+            read the need: it gets None, and does not run again when the need changes.
         skip_if: the stage is skipped if one of these conditions is true.
         export: folders of the artifact that are copied to runs/<scene>/, where people work with the files.
-        params: defaults of the stage's parameters, below those of profiles.
     """
 
     needs: tuple[str, ...]
@@ -110,7 +110,6 @@ class Stage(Strict):
     ignore: dict[str, dict[str, Any]] = {}
     skip_if: tuple[Condition, ...] = ()
     export: tuple[str, ...] = ()
-    params: dict[str, Any] = {}
 
     @property
     def all_needs(self) -> tuple[str, ...]:
@@ -207,8 +206,7 @@ class Pipeline(Strict):
         """
         if target == "all":
             return list(self.stages)
-        if target not in self.stages:
-            raise Refused(f"pipeline.yaml: {unknown_name('stage', target, ['all', *self.stages])}")
+        check_known("pipeline.yaml", "stage", target, ["all", *self.stages])
         names = {target}
         for name in reversed(self.stages):
             if name in names:
@@ -216,17 +214,16 @@ class Pipeline(Strict):
         return [name for name in self.stages if name in names]
 
 
-def unknown_name(kind: str, name: object, known: Any) -> str:
-    """Return the message for an unknown name, with the most similar known name or else all known names.
+def check_known(origin: str, kind: str, name: str | None, known: Iterable[str]) -> None:
+    """Raise Refused if a name that was given is unknown; None stands for a name that was not given.
 
     Args:
-        kind: what is named, e.g. "stage".
-        name: the unknown name.
-        known: the known names.
+        origin: where the name was given, for the message.
+        kind, known: as in `text.unknown_name`.
+        name: the name.
     """
-    known = [str(k) for k in known]
-    near = difflib.get_close_matches(str(name), known, n=1)
-    return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
+    if name is not None and name not in known:
+        raise Refused(f"{origin}: {unknown_name(kind, name, known)}")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -291,13 +288,13 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     content = read_user_yaml(path, typed=("stages",))
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     known = [*keys, "profile", "budget", "stages"]
-    for key in (key for key in content if key not in known):
-        raise Refused(f"{path}: {unknown_name('key', key, known)}")
+    for key in content:
+        check_known(str(path), "key", key, known)
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
-    for stage in (stage for stage in stages if stage not in pipeline.stages):
-        raise Refused(f"{path}: stages: {unknown_name('stage', stage, pipeline.stages)}")
+    for stage in stages:
+        check_known(f"{path}: stages", "stage", stage, pipeline.stages)
     if not isinstance(content.get("profile"), str | None):
         raise Refused(f"{path}: profile: expected the name of one")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}

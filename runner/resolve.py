@@ -16,8 +16,9 @@ from runner.files import list_files, read_text
 from runner.frames import FRAMES, update_frames
 from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, flatten_params, paths_outside
 from runner.parameters import Layers, parse_duration, parse_set, split_budget, stack_layers
-from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, unknown_name
+from runner.pipeline import SCENE, Pipeline, SceneFile, check_known, find_scene, load_pipeline, load_scene_file
 from runner.process import ask_stages
+from runner.text import unknown_name
 
 AUTO = "auto"  # stands for the profile that suits this machine
 WORKER = Path(__file__).with_name("worker.py")
@@ -178,10 +179,8 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
         if source.is_file():
             update_frames(source, folder, root, hashes)
         found = load_scene_file(folder, pipeline)
-    if request.gpu and request.gpu not in pipeline.gpus:
-        raise Refused(f"gpu={request.gpu}: {unknown_name('GPU', request.gpu, pipeline.gpus)}")
-    if variant and variant not in pipeline.variants:
-        raise Refused(f"{root / 'pipeline.yaml'}: {unknown_name('variant', variant, pipeline.variants)}")
+    check_known(f"gpu={request.gpu}", "GPU", request.gpu or None, pipeline.gpus)
+    check_known(str(root / "pipeline.yaml"), "variant", variant or None, pipeline.variants)
     pinned = [home / "profile" for home in (variant_folder(base, variant), base)]
     profile, why = choose_profile(request.profile, found, pinned, pipeline, request.cuda)
     if request.compared and profile in pipeline.comparisons:

@@ -14,9 +14,9 @@ from runner.artifacts import delete_folder, diff_artifact, recover_swap
 from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
 from runner.frames import FRAMES
 from runner.keys import HASHES, Hashes
-from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown_name
+from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline
 from runner.resolve import Request, check_unique_name
-from runner.text import display_path, join_names
+from runner.text import display_path, join_names, unknown_name
 
 # Files that the runner and report/ write to runs/<scene>/ besides artifacts.
 RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "before_after.webp", "check.png")
