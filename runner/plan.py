@@ -70,8 +70,8 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
         Refused: the stage's file is broken, or a condition of pipeline.yaml cannot be evaluated.
     """
     spec = job.pipeline.stages[stage]
-    if stage in job.broken:
-        raise Refused(job.broken[stage])
+    if job.stages[stage].broken:
+        raise Refused(job.stages[stage].broken)
     own = spec.provided
     if own and own.by in job.brings and _have_values(job, own.expected):
         source = earlier[own.artifact]
@@ -245,7 +245,7 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
 
 def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
     """Build a stage's question (`worker.describe`); if the stage may run, the paths of its needs ask for a preview."""
-    spec, question = job.pipeline.stages[stage], job.question(stage)
+    spec, question = job.pipeline.stages[stage], job.weights_question(stage)
     # A stage that reads the scene is asked before its other needs have run, so that it can refuse the scene early.
     reads_scene = SCENE in spec.all_needs
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}

@@ -71,10 +71,12 @@ def describe() -> None:
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
-    path = description_file(stage)
+    path, own = description_file(stage), Path(f"stages/{stage}.py")
+    if not own.is_file():
+        return {"broken": f"{own}: no such file, and pipeline.yaml names it"}
     try:
         planned = import_file(path)
-        path = Path(f"stages/{stage}.py")
+        path = own
         _check_run(path, question["takes"])
     except Exception as error:
         return {"broken": f"{path}: {format_error(error)}"}  # the stage's code has an error
