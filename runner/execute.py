@@ -5,7 +5,6 @@ A stage works in a folder of its own, which is renamed to its final place when t
 """
 
 import errno
-import functools
 import importlib.metadata
 import json
 import platform
@@ -145,7 +144,7 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         **asdict(inputs),
         "profile": job.profile,
         **artifacts.hash_contents(folder, job.hashes),
-        "versions": {"python": platform.python_version(), **_installed()},
+        "versions": _versions(),
         "platform": platform.platform(),
         "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
@@ -155,10 +154,9 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
     }
 
 
-@functools.cache
-def _installed() -> dict[str, str]:
-    """Return the versions of the installed packages among `PACKAGES`."""
-    found = {}
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the installed packages among `PACKAGES`."""
+    found = {"python": platform.python_version()}
     for name in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)

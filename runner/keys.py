@@ -55,31 +55,24 @@ class Hashes:
 
     Attributes:
         path: the JSON file.
-        recompute: True ignores cached hashes.
-        corrupt: files whose content differs from the cached hash, although size and time are the same. They are only
-            found with `recompute`.
         known: the entries of the cache.
     """
 
     LIMIT = 100_000  # number of entries that are saved, the newest ones; a demo scene and its results have 1,000
 
-    def __init__(self, path: Path, recompute: bool = False):
-        """Load the cache from `path`; it starts empty if there is no such file. For the arguments see the class."""
-        self.path, self.recompute = path, recompute
-        self.corrupt: list[Path] = []
+    def __init__(self, path: Path):
+        """Load the cache from `path`; it starts empty if there is no such file."""
         found = read_json(path)
-        self.known: dict[str, Any] = found if isinstance(found, dict) else {}
-        self._saved, self._saving = 0 if recompute else len(self.known), threading.Lock()
+        self.path, self.known = path, found if isinstance(found, dict) else {}
+        self._saved, self._saving = self.known.copy(), threading.Lock()
         self._imports: dict[tuple[Path, str], list[Path]] = {}  # (module, fingerprint) -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
         """Return the cached value of a `kind` ("file" or "module") for a file, or compute it by `compute(path)`."""
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self.known or self.recompute:
-            before, self.known[name] = self.known.get(name), compute(path)
-            if before not in (None, self.known[name]):
-                self.corrupt.append(path)
+        if name not in self.known:
+            self.known[name] = compute(path)
         return self.known[name]
 
     def file(self, path: Path) -> str:
@@ -126,14 +119,14 @@ class Hashes:
         return self.file(folder) if folder.is_file() else hash_listing(self.listing(folder, read))
 
     def save(self) -> None:
-        """Write the cache to its file, unless it has no new entries."""
-        if len(self.known) == self._saved:
+        """Write the cache to its file, unless it is as it was read or written before."""
+        if (known := self.known.copy()) == self._saved:  # a copy, since other threads may add to it
             return
-        kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
+        kept = dict(list(known.items())[-self.LIMIT :])
         # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
         with suppress(OSError), self._saving:
             write_text(self.path, json.dumps(kept))
-            self._saved = len(self.known)
+            self._saved = known
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
