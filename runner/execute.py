@@ -19,7 +19,7 @@ from typing import Any
 
 from runner import Failed, Refused, artifacts, files, say
 from runner.durations import format_total_time, seconds_by_stage, typical_seconds
-from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
+from runner.files import RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import Decision, decide, partial_folder, plan, used_needs
@@ -146,7 +146,6 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         **artifacts.hash_contents(folder, job.hashes),
         "versions": _versions(),
         "platform": platform.platform(),
-        "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
         "typical_seconds": typical_seconds(job, stage),
         **result,

@@ -13,7 +13,6 @@ import faulthandler
 import importlib
 import json
 import os
-import platform
 import reprlib
 import resource
 import signal
@@ -31,7 +30,7 @@ from typing import Any, TextIO, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from runner.files import list_files
+from runner.files import MACHINE, list_files
 from runner.text import format_error
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -221,7 +220,7 @@ def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
         log.write(traceback.format_exc())
         return {"error": format_error(error)[:9999]}  # short enough for the buffer of a pipe
     seconds = round(time.perf_counter() - started, 2)
-    return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": platform.node()}
+    return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": MACHINE}
 
 
 def _end_with_runner(fd: int) -> None:
