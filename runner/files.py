@@ -45,7 +45,7 @@ def list_files(folder: Path) -> Iterator[Path]:
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.writing")  # runners of other scenes may write it, too
+    partial = path.with_name(f".{path.name}.writing")
     try:
         partial.write_text(text, encoding="utf-8")
         os.replace(partial, path)

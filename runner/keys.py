@@ -125,7 +125,9 @@ class Hashes:
         kept = dict(list(known.items())[-self.LIMIT :])
         # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
         with suppress(OSError), self._saving:
-            write_text(self.path, json.dumps(kept))
+            partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
+            write_text(partial, json.dumps(kept))
+            os.replace(partial, self.path)
             self._saved = known
 
 

@@ -130,7 +130,7 @@ def _fact(folder: Path, name: str) -> Any:
 
 def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
     """Return a condition's reason, in which the names of facts in braces are replaced by their values."""
-    value = lambda name: str(_fact(earlier[condition.names[0]].path, name[1]))
+    value = lambda found: str(_fact(earlier[condition.names[0]].path, found[1]))
     return re.sub(r"{(\w+)}", value, condition.reason)
 
 
