@@ -4,7 +4,7 @@ Terms are explained in `runner`. This module imports nothing heavy.
 """
 
 import json
-import re
+import string
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,8 +130,9 @@ def _fact(folder: Path, name: str) -> Any:
 
 def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
     """Return a condition's reason, in which the names of facts in braces are replaced by their values."""
-    value = lambda found: str(_fact(earlier[condition.names[0]].path, found[1]))
-    return re.sub(r"{(\w+)}", value, condition.reason)
+    names = [name for _, name, _, _ in string.Formatter().parse(condition.reason) if name]
+    folder = earlier[condition.names[0]].path if names else None
+    return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
 
 
 def _have_values(job: ResolvedJob, expected: dict[str, Any]) -> bool:
