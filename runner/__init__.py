@@ -25,7 +25,7 @@ Modules:
   - files.py: atomic writes, locks, exported copies.
 - worker.py: the process that imports stages. process.py: starts this process, sends it questions, runs stages in it.
 - results.py: prints scores, and records plans for report/.
-- text.py: errors, sizes, times and paths as text.
+- text.py: errors, sizes, times, names and paths as text.
 - fleet/: commands on many scenes, variants or machines, and those beside a run. Only __main__.py imports it.
   - commands.py: their command lines.
   - compare.py: the commands `compare` and `batch`. parallel.py: several runs at once. progress.py: shows each.

@@ -11,7 +11,7 @@ from typing import Any
 
 from runner import say
 from runner.files import RECEIPT, read_receipt, write_json
-from runner.keys import Hashes, hash_listing
+from runner.keys import NOT_CONTENT, Hashes, hash_listing
 from runner.text import display_path, join_names
 
 KEPT = "kept"  # folder in runs/<scene>/ for files that people had changed in artifacts that were then replaced
@@ -60,7 +60,7 @@ def hash_contents(folder: Path, hashes: Hashes) -> dict[str, Any]:
         of the files on which other stages may depend, i.e. without traces, warnings and checkpoints.
     """
     files = {name: file for name, file in hashes.listing(folder).items() if name != RECEIPT}
-    return {"files": files, "output": hash_listing(files)}
+    return {"files": files, "output": hash_listing(files, NOT_CONTENT)}
 
 
 def accept_changes(folder: Path, hashes: Hashes) -> None:
@@ -87,14 +87,14 @@ def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
     if place.exists():
         place.rename(old)
     partial.rename(place)
-    _retire(old, place, hashes)
+    recover_swap(place.parent, hashes)
 
 
 def recover_swap(home: Path, hashes: Hashes) -> None:
-    """Undo or finish what a killed runner had begun: replacements (`replace_artifact`) and deletions of artifacts.
+    """Finish or undo the replacements of artifacts that have begun, also by a killed runner, and finish deletions.
 
-    If the new artifact is in place, a replacement is finished; else the old artifact is restored. Deletions are
-    finished.
+    If the new artifact is in place, the old one is deleted, after the files that people changed or added are moved out
+    (`replace_artifact`); the names of changed ones are printed. Else the old artifact is restored.
 
     Args:
         home: folder of a scene or variant in runs/.
@@ -105,15 +105,14 @@ def recover_swap(home: Path, hashes: Hashes) -> None:
     for old in home.glob(".old-*"):
         place = home / old.name.removeprefix(".old-")
         if place.exists():
-            _retire(old, place, hashes)
+            _rescue_files(old, place, hashes)
+            delete_folder(old)
         else:
             old.rename(place)
 
 
-def _retire(old: Path, place: Path, hashes: Hashes) -> None:
-    """Delete an old artifact, if it exists, after moving out files that people changed or added; print moved names."""
-    if not old.exists():
-        return
+def _rescue_files(old: Path, place: Path, hashes: Hashes) -> None:
+    """Move the files that people changed or added out of an old artifact, which is replaced by that at `place`."""
     diff, kept = diff_artifact(old, hashes), place.parent / KEPT / place.name
     # Files that people changed, or that `keep` accepted, go to kept/<stage>/. Added files go to the new artifact,
     # or to kept/<stage>/ if it has a file of this name.
@@ -126,7 +125,6 @@ def _retire(old: Path, place: Path, hashes: Hashes) -> None:
         (old / name).rename(free)
     if moved := [name for name, target in targets.items() if kept in target.parents]:
         say(f"{place.name}: {join_names(moved)} was changed since it was made: now in {display_path(kept)}/")
-    delete_folder(old)
 
 
 def delete_folder(folder: Path) -> None:

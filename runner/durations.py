@@ -26,7 +26,7 @@ PRIOR_SECONDS = 60  # the table's own weight beside the receipts, as if a machin
 
 def receipts_of_variants(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
     """Return the existing receipts of a stage in the scene's own run and then in its variants."""
-    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
+    places = [job.base, *job.runs.glob(f"{job.base.name}@*")]
     return [receipt for place in places if (receipt := read_receipt(place / stage))]
 
 

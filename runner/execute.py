@@ -5,7 +5,6 @@ A stage works in a folder of its own, which is renamed to its final place when t
 """
 
 import errno
-import functools
 import importlib.metadata
 import json
 import platform
@@ -20,7 +19,7 @@ from typing import Any
 
 from runner import Failed, Refused, artifacts, files, say
 from runner.durations import format_total_time, seconds_by_stage, typical_seconds
-from runner.files import MACHINE, RECEIPT, read_json, read_receipt, write_json, write_text
+from runner.files import RECEIPT, read_json, read_receipt, write_json, write_text
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import Decision, decide, partial_folder, plan, used_needs
@@ -145,9 +144,8 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         **asdict(inputs),
         "profile": job.profile,
         **artifacts.hash_contents(folder, job.hashes),
-        "versions": {"python": platform.python_version(), **_installed()},
+        "versions": _versions(),
         "platform": platform.platform(),
-        "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
         "typical_seconds": typical_seconds(job, stage),
         **result,
@@ -155,10 +153,9 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
     }
 
 
-@functools.cache
-def _installed() -> dict[str, str]:
-    """Return the versions of the installed packages among `PACKAGES`."""
-    found = {}
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the installed packages among `PACKAGES`."""
+    found = {"python": platform.python_version()}
     for name in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)

@@ -138,17 +138,14 @@ def lock_holder(runs: Path, name: str) -> tuple[str, str] | None:
 
     Shared holders are not seen, because they do not write into the lock's file.
     """
-    try:
-        with open(runs / ".locks" / name) as file:
-            holder = _holder(file.fileno())
-            if not holder[0]:
-                return None
-            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)  # succeeds if the holder was killed
-            return None
-    except BlockingIOError:
-        return holder
-    except OSError:
-        return None
+    with suppress(OSError), open(runs / ".locks" / name) as file:
+        holder = _holder(file.fileno())
+        try:
+            if holder[0]:
+                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)  # succeeds if the holder was killed
+        except BlockingIOError:
+            return holder
+    return None
 
 
 def _holder(lock: int) -> tuple[str, str]:

@@ -1,6 +1,5 @@
 """Scenes that are videos: extraction of the frames into a folder, which is then used as the scene."""
 
-import json
 import subprocess
 from pathlib import Path
 
@@ -36,8 +35,9 @@ def update_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None
         of = f"frames of another video, {found['video']} as it was"
         of += f", and {display_path(others[0])} for them" if others else ""
         raise Refused(f"{display_path(folder)} holds {of}; rename the video, or move that folder away")
-    process = start_worker(root, "frames", stdout=subprocess.PIPE)
-    message, _ = process.communicate(json.dumps({"video": str(video), "folder": str(folder), "content": content}))
+    module = "reffusion.capture.video_frames"  # in a process of its own, since it imports heavy modules
+    process = start_worker(root, str(video), str(folder), content, module=module, stdout=subprocess.PIPE)
+    message, _ = process.communicate()
     if process.returncode:
         raise Refused(message.strip() or f"{video}: its frames could not be taken (see above)")
     say(message.strip())

@@ -36,7 +36,7 @@ def _hash_content(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
-def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
+def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = ()) -> str:
     """Hash a listing of files to one hash, which depends on the order of the listing, too.
 
     Args:
@@ -55,31 +55,24 @@ class Hashes:
 
     Attributes:
         path: the JSON file.
-        recompute: True ignores cached hashes.
-        corrupt: files whose content differs from the cached hash, although size and time are the same. They are only
-            found with `recompute`.
         known: the entries of the cache.
     """
 
     LIMIT = 100_000  # number of entries that are saved, the newest ones; a demo scene and its results have 1,000
 
-    def __init__(self, path: Path, recompute: bool = False):
-        """Load the cache from `path`; it starts empty if there is no such file. For the arguments see the class."""
-        self.path, self.recompute = path, recompute
-        self.corrupt: list[Path] = []
+    def __init__(self, path: Path):
+        """Load the cache from `path`; it starts empty if there is no such file."""
         found = read_json(path)
-        self.known: dict[str, Any] = found if isinstance(found, dict) else {}
-        self._saved, self._saving = 0 if recompute else len(self.known), threading.Lock()
+        self.path, self.known = path, found if isinstance(found, dict) else {}
+        self._saved, self._saving = self.known.copy(), threading.Lock()
         self._imports: dict[tuple[Path, str], list[Path]] = {}  # (module, fingerprint) -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
         """Return the cached value of a `kind` ("file" or "module") for a file, or compute it by `compute(path)`."""
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self.known or self.recompute:
-            before, self.known[name] = self.known.get(name), compute(path)
-            if before not in (None, self.known[name]):
-                self.corrupt.append(path)
+        if name not in self.known:
+            self.known[name] = compute(path)
         return self.known[name]
 
     def file(self, path: Path) -> str:
@@ -114,33 +107,28 @@ class Hashes:
 
     def listing(self, folder: Path, files: Iterable[Path] | None = None) -> dict[str, str]:
         """Return name relative to `folder` -> hash of `files`; None for all files below it without hidden ones."""
-        top = os.path.join(folder, "")
-        name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
-        return {name(str(path)): self.file(path) for path in (list_files(folder) if files is None else files)}
-
-    def files(self, folder: Path, files: Iterable[Path]) -> str:
-        """Return one hash of the contents of `files` and of their names relative to `folder`, in the given order."""
-        return hash_listing(self.listing(folder, files), exclude=())
+        chosen = list_files(folder) if files is None else files
+        return {os.path.relpath(path, folder): self.file(path) for path in chosen}
 
     def weights(self, folder: Path) -> str:
         """Return the hash of a file of weights, or of the folder of a model.
 
         The model's card, pictures and scripts in the folder are left out, so that editing them reruns no stage.
         """
-        read = [path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS]
-        return self.file(folder) if folder.is_file() else self.files(folder, read)
+        read = (path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS)
+        return self.file(folder) if folder.is_file() else hash_listing(self.listing(folder, read))
 
     def save(self) -> None:
-        """Write the cache to its file, unless it has no new entries."""
-        if len(self.known) == self._saved:
+        """Write the cache to its file, unless it is as it was read or written before."""
+        if (known := self.known.copy()) == self._saved:  # a copy, since other threads may add to it
             return
-        kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
+        kept = dict(list(known.items())[-self.LIMIT :])
         # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
         with suppress(OSError), self._saving:
             partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)
-            self._saved = len(self.known)
+            self._saved = known
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:

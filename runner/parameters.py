@@ -12,7 +12,7 @@ from typing import Any
 
 from runner import Refused
 from runner.keys import flatten_params
-from runner.pipeline import Overrides, Pipeline, SceneFile, unknown_name
+from runner.pipeline import Overrides, Pipeline, SceneFile, check_known
 from runner.user_yaml import parse_value
 
 SECONDS = "seconds"  # name of the parameter that is set to the stage's share of the time budget
@@ -50,8 +50,7 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
         if not match:
             raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
         stage, names, value_text = match.groups()
-        if stage not in pipeline.stages:
-            raise Refused(f"set: {unknown_name('stage', stage, pipeline.stages)}")
+        check_known("set", "stage", stage, pipeline.stages)
         try:
             value = parse_value(value_text, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
         except ValueError:
@@ -96,8 +95,8 @@ def stack_layers(
 ) -> Layers:
     """Merge the layers of parameters.
 
-    The layers are, from low to high priority: defaults of stages in pipeline.yaml, the profile, shares of a time
-    budget, scene.yaml, the variant, and `set=`. Groups of parameters are merged. A key of scene.yaml is one value, even
+    The layers are, from low to high priority: the profile, shares of a time budget, scene.yaml, the variant, and
+    `set=`. Groups of parameters are merged. A key of scene.yaml is one value, even
     if it is a mapping (`reference: {view, image, depth}`), and is replaced as a whole.
 
     Args:
@@ -110,7 +109,6 @@ def stack_layers(
     keys, brings = pipeline.scene_keys, scene.brings
     scene_params = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
     layers = (
-        ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
         ("budget", shares),
         (str(scene.path), scene_params),

@@ -3,8 +3,8 @@
 Parameters are named `<stage>.<name>` here, with dots for groups, such as `distill.sds.weight`.
 """
 
-import difflib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, NonNegativeFloat, PositiveFloat
 
 from reffusion.command import scene_name, scene_path, workplace
 from runner import Refused
+from runner.text import unknown_name
 from runner.user_yaml import read_user_yaml
 
 SCENE = "scene"  # the need that stands for the scene's own folder
@@ -27,26 +28,39 @@ class Strict(BaseModel, extra="forbid", frozen=True):
     """Base class of the parts of pipeline.yaml, in which unknown keys are errors."""
 
 
-class Condition(Strict):
+class ByParameters(Strict):
+    """What pipeline.yaml says for certain values of parameters only.
+
+    Attributes:
+        param: <stage>.<name>, or several such names, of any stages; these parameters must equal `equals`.
+        equals: see `param`.
+        only: <stage>.<name> -> the value that this parameter must have.
+    """
+
+    param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
+    equals: Any = None
+    only: dict[str, Any] = {}
+
+    @property
+    def expected(self) -> dict[str, Any]:
+        """The parameters, <stage>.<name>, that must have certain values, with these values."""
+        return self.only | dict.fromkeys(self.param, self.equals)
+
+
+class Condition(ByParameters):
     """A condition under which a stage is skipped. It tests exactly one of `fact`, `param` and `empty`.
 
     Attributes:
         reason: why the stage is skipped, for the user; may name facts of the tested stage in braces.
         fact: <stage>.<name>; true if this value of an earlier stage's facts.json equals `equals`.
-        param: <stage>.<name>, or several such names; true if all these parameters, of any stages, equal `equals`.
-        equals: see `fact` and `param`.
         empty: <stage>/<folder>; true if this folder of an earlier stage's artifact has no files.
         unless: the condition is false if scene.yaml has one of these keys.
-        only: <stage>.<name> -> value; the condition is false unless each of these parameters has its value.
     """
 
     reason: str
     fact: str | None = None
-    param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
-    equals: Any = None
     empty: str | None = None
     unless: tuple[str, ...] = ()
-    only: dict[str, Any] = {}
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
@@ -56,18 +70,13 @@ class Condition(Strict):
         return self
 
     @property
-    def expected(self) -> dict[str, Any]:
-        """The parameters, <stage>.<name>, that must have certain values if the condition is true, with these values."""
-        return self.only | dict.fromkeys(self.param, self.equals)
-
-    @property
     def names(self) -> tuple[str, str]:
         """The stage that the condition tests, and the name of the (first) fact, parameter or folder."""
         stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
 
 
-class Substitute(Strict):
+class Substitute(ByParameters):
     """The replacement of a stage by a file that the scene brings.
 
     If scene.yaml has the key `by`, the artifact of the earlier stage `artifact` is used instead of the stage's own.
@@ -75,26 +84,10 @@ class Substitute(Strict):
     Attributes:
         by: key of scene.yaml.
         artifact: name of the earlier stage.
-        param: a parameter `<stage>.<name>`; the stage is only replaced while this parameter equals `equals`. None:
-            always.
-        equals: see `param`.
     """
 
     by: str
     artifact: str
-    param: str | None = None
-    equals: Any = None
-
-
-class IgnoredNeed(Strict):
-    """An optional need that a stage does not read while the parameter `param`, `<stage>.<name>`, equals `equals`.
-
-    The stage then gets None instead of the need's folder, and does not run again when the need changes.
-    """
-
-    need: str
-    param: str
-    equals: Any
 
 
 class Stage(Strict):
@@ -105,19 +98,18 @@ class Stage(Strict):
             is skipped, the stage is skipped too.
         optional: further needs that may be skipped; the stage then gets None instead of a folder.
         provided: the file of the scene that may replace the stage.
-        ignore: an optional need that the stage does not always read.
+        ignore: optional need -> parameters with values, as in `only`. While all have these values, the stage does not
+            read the need: it gets None, and does not run again when the need changes.
         skip_if: the stage is skipped if one of these conditions is true.
         export: folders of the artifact that are copied to runs/<scene>/, where people work with the files.
-        params: defaults of the stage's parameters, below those of profiles.
     """
 
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
     provided: Substitute | None = None
-    ignore: IgnoredNeed | None = None
+    ignore: dict[str, dict[str, Any]] = {}
     skip_if: tuple[Condition, ...] = ()
     export: tuple[str, ...] = ()
-    params: dict[str, Any] = {}
 
     @property
     def all_needs(self) -> tuple[str, ...]:
@@ -129,7 +121,7 @@ class Stage(Strict):
         """All needs, and the stages that must be done before a condition can be tested or the stage be replaced."""
         tested = (condition.names[0] for condition in self.skip_if if not condition.param)
         replaced = [self.provided.artifact] if self.provided else []
-        return (*self.all_needs, *tested, *replaced, *([self.ignore.need] if self.ignore else []))
+        return (*self.all_needs, *tested, *replaced, *self.ignore)
 
 
 class Memory(Strict):
@@ -214,8 +206,7 @@ class Pipeline(Strict):
         """
         if target == "all":
             return list(self.stages)
-        if target not in self.stages:
-            raise Refused(f"pipeline.yaml: {unknown_name('stage', target, ['all', *self.stages])}")
+        check_known("pipeline.yaml", "stage", target, ["all", *self.stages])
         names = {target}
         for name in reversed(self.stages):
             if name in names:
@@ -223,17 +214,16 @@ class Pipeline(Strict):
         return [name for name in self.stages if name in names]
 
 
-def unknown_name(kind: str, name: object, known: Any) -> str:
-    """Return the message for an unknown name, with the most similar known name or else all known names.
+def check_known(origin: str, kind: str, name: str | None, known: Iterable[str]) -> None:
+    """Raise Refused if a name that was given is unknown; None stands for a name that was not given.
 
     Args:
-        kind: what is named, e.g. "stage".
-        name: the unknown name.
-        known: the known names.
+        origin: where the name was given, for the message.
+        kind, known: as in `text.unknown_name`.
+        name: the name.
     """
-    known = [str(k) for k in known]
-    near = difflib.get_close_matches(str(name), known, n=1)
-    return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
+    if name is not None and name not in known:
+        raise Refused(f"{origin}: {unknown_name(kind, name, known)}")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -298,13 +288,13 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     content = read_user_yaml(path, typed=("stages",))
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     known = [*keys, "profile", "budget", "stages"]
-    for key in (key for key in content if key not in known):
-        raise Refused(f"{path}: {unknown_name('key', key, known)}")
+    for key in content:
+        check_known(str(path), "key", key, known)
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
-    for stage in (stage for stage in stages if stage not in pipeline.stages):
-        raise Refused(f"{path}: stages: {unknown_name('stage', stage, pipeline.stages)}")
+    for stage in stages:
+        check_known(f"{path}: stages", "stage", stage, pipeline.stages)
     if not isinstance(content.get("profile"), str | None):
         raise Refused(f"{path}: profile: expected the name of one")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}

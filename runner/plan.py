@@ -70,10 +70,10 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
         Refused: the stage's file is broken, or a condition of pipeline.yaml cannot be evaluated.
     """
     spec = job.pipeline.stages[stage]
-    if stage in job.broken:
-        raise Refused(job.broken[stage])
+    if job.stages[stage].broken:
+        raise Refused(job.stages[stage].broken)
     own = spec.provided
-    if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
+    if own and own.by in job.brings and _have_values(job, own.expected):
         source = earlier[own.artifact]
         return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
     open_questions: list[str] = []
@@ -98,20 +98,15 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """Return the names of a stage's needs, `scene` included, without the need that the parameters say to ignore.
-
-    For the ignored need see `pipeline.IgnoredNeed`.
-    """
+    """Return the names of a stage's needs, `scene` included, without those that the parameters say to ignore."""
     spec = job.pipeline.stages[stage]
-    ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
-    return [need for need in spec.all_needs if need != ignored]
+    return [need for need in spec.all_needs if need not in spec.ignore or not _have_values(job, spec.ignore[need])]
 
 
 def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Evaluate a condition of pipeline.yaml; None if an earlier stage must run before the answer is known."""
     stage, name = condition.names
-    expected = condition.expected.items()
-    if job.brings.intersection(condition.unless) or not all(_has_value(job, *each) for each in expected):
+    if job.brings.intersection(condition.unless) or not _have_values(job, condition.expected):
         return False
     if condition.param:
         return True
@@ -140,12 +135,12 @@ def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
     return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
 
 
-def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
-    """Return whether the parameter `<stage>.<name>` has this value. Raises Refused if there is no such parameter."""
+def _have_values(job: ResolvedJob, expected: dict[str, Any]) -> bool:
+    """Return whether all parameters `<stage>.<name>` have these values. Raises Refused if one does not exist."""
     params = flatten_params(job.params)
-    if param not in params:
-        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
-    return params[param] == value
+    for name in (name for name in expected if name not in params):
+        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {name}, which is not there")
+    return expected.items() <= params.items()
 
 
 def _receipts(job: ResolvedJob, stage: str) -> dict[Path, dict[str, Any]]:
@@ -169,7 +164,7 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
     hashes |= {f"machine: {name}": fact for name, fact in own.machine.items()}
     if own.reads is not None:
-        hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
+        hashes[SCENE] = keys.hash_listing(job.hashes.listing(job.folder, map(Path, own.reads)))
     elif SCENE in job.pipeline.stages[stage].all_needs:
         hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
         for path in job.paths_outside(stage):
@@ -251,7 +246,7 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
 
 def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
     """Build a stage's question (`worker.describe`); if the stage may run, the paths of its needs ask for a preview."""
-    spec, question = job.pipeline.stages[stage], job.question(stage)
+    spec, question = job.pipeline.stages[stage], job.weights_question(stage)
     # A stage that reads the scene is asked before its other needs have run, so that it can refuse the scene early.
     reads_scene = SCENE in spec.all_needs
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}

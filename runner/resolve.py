@@ -16,8 +16,9 @@ from runner.files import list_files, read_text
 from runner.frames import FRAMES, update_frames
 from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, flatten_params, paths_outside
 from runner.parameters import Layers, parse_duration, parse_set, split_budget, stack_layers
-from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, unknown_name
+from runner.pipeline import SCENE, Pipeline, SceneFile, check_known, find_scene, load_pipeline, load_scene_file
 from runner.process import ask_stages
+from runner.text import unknown_name
 
 AUTO = "auto"  # stands for the profile that suits this machine
 WORKER = Path(__file__).with_name("worker.py")
@@ -69,9 +70,10 @@ class StageInfo:
         facts: facts about the scene on which the artifact depends besides the files in `reads`, e.g. names of files.
         machine: facts about this machine on which the artifact depends.
         unavailable: optional features, such as LPIPS, that this machine does not have.
+        broken: why the stage cannot be imported; then nothing else is known.
     """
 
-    params: dict[str, Any]
+    params: dict[str, Any] = field(default_factory=dict)
     weights: tuple[str, ...] = ()
     unkeyed: tuple[str, ...] = ()
     programs: tuple[str, ...] = ()
@@ -79,6 +81,7 @@ class StageInfo:
     facts: dict[str, Any] = field(default_factory=dict)
     machine: dict[str, str] = field(default_factory=dict)
     unavailable: tuple[str, ...] = ()
+    broken: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +97,7 @@ class ResolvedJob(Request):
         why: the reason for this profile, in words.
         brings: the keys of scene.yaml that describe the scene and have values.
         hashes: the cache of hashes.
-        stages: stage -> its description, for the stages that are not broken.
-        broken: stage that cannot be imported -> the error.
+        stages: stage -> its description.
     """
 
     folder: Path
@@ -107,7 +109,6 @@ class ResolvedJob(Request):
     brings: frozenset[str]
     hashes: Hashes
     stages: dict[str, StageInfo] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)
 
     @property
     def home(self) -> Path:
@@ -128,14 +129,18 @@ class ResolvedJob(Request):
         return list(paths_outside(info.params, self.folder)) if takes_scene else []
 
     def question(self, stage: str) -> dict[str, Any]:
-        """Build the question to a stage about the weights that it needs, see `worker.describe`.
+        """Build the question to a stage about its parameters, see `worker.describe`."""
+        takes = self.pipeline.stages[stage].all_needs
+        return {"stage": stage, "params": self.layers.values[stage], "takes": takes}
+
+    def weights_question(self, stage: str) -> dict[str, Any]:
+        """Build the question to a stage about its parameters and the weights that it needs, see `worker.describe`.
 
         The weights depend on what the scene brings, so the question has the keys of scene.yaml and the names of the
         scene's folders. The answer is not cached, because weights may be downloaded or removed at any time.
         """
         folders = [path.name for path in self.folder.iterdir() if path.is_dir()] if self.folder != self.root else ()
-        question = {"stage": stage, "params": self.stages[stage].params, "takes": self.pipeline.stages[stage].all_needs}
-        return question | {"brings": sorted({*self.brings, *folders})}
+        return self.question(stage) | {"brings": sorted({*self.brings, *folders})}
 
 
 def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> ResolvedJob:
@@ -178,10 +183,8 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
         if source.is_file():
             update_frames(source, folder, root, hashes)
         found = load_scene_file(folder, pipeline)
-    if request.gpu and request.gpu not in pipeline.gpus:
-        raise Refused(f"gpu={request.gpu}: {unknown_name('GPU', request.gpu, pipeline.gpus)}")
-    if variant and variant not in pipeline.variants:
-        raise Refused(f"{root / 'pipeline.yaml'}: {unknown_name('variant', variant, pipeline.variants)}")
+    check_known(f"gpu={request.gpu}", "GPU", request.gpu or None, pipeline.gpus)
+    check_known(str(root / "pipeline.yaml"), "variant", variant or None, pipeline.variants)
     pinned = [home / "profile" for home in (variant_folder(base, variant), base)]
     profile, why = choose_profile(request.profile, found, pinned, pipeline, request.cuda)
     if request.compared and profile in pipeline.comparisons:
@@ -262,14 +265,12 @@ def check_unique_name(base: Path, folder: Path, root: Path) -> None:
 
 
 def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
-    """Return the questions, see `worker.describe`, to all stages that have a file, by the keys of `_answer_key`."""
+    """Return the questions to all stages, see `worker.describe`, by the keys of `_answer_key`."""
     questions = {}
-    for stage, spec in job.pipeline.stages.items():
-        if (job.root / "stages" / f"{stage}.py").is_file():
-            question = {"stage": stage, "params": job.layers.values[stage], "takes": spec.all_needs}
-            if SCENE in spec.all_needs and job.folder != job.root:
-                question["scene"] = str(job.folder)
-            questions[_answer_key(job, question)] = question
+    for question in map(job.question, job.pipeline.stages):
+        if SCENE in question["takes"] and job.folder != job.root:
+            question["scene"] = str(job.folder)
+        questions[_answer_key(job, question)] = question
     return questions
 
 
@@ -280,7 +281,7 @@ def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
     try:
         code = code_fingerprints(job.root, stage, job.hashes, folder)
         code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
-    except Refused as error:  # not valid Python, which no plan accepts
+    except (Refused, OSError) as error:  # not valid Python, or no file, which no plan accepts
         code = {"error": str(error)}
     listed = list_files(job.folder) if "scene" in question else ()
     files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
@@ -300,20 +301,18 @@ def _is_lasting(question: dict[str, Any], answer: dict[str, Any]) -> bool:
 
 def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> ResolvedJob:
     """Add the stages' descriptions from `answers` (by key) to a job; raises Refused for the first wrong parameter."""
-    broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
     stages = {}
     for name, question in questions.items():
         stage, answer = question["stage"], answers[name]
         for error in answer.get("errors", ()):
             origin = job.layers.origin(stage, error["where"])
-            raise Refused(f"{origin}: {_refusal(stage, error, answer['known'])}")
-        if "broken" in answer:
-            broken[stage] = answer["broken"]
-        else:
-            stages[stage] = StageInfo(**answer)
-            _refuse_programs_of_scene(job, stage, stages[stage])
-            del broken[stage]
-    return replace(job, stages=stages, broken=broken)
+            wrong = f"{stage}.{error['where']} = {error['value']}: {error['message']}"
+            if error["unknown"]:
+                wrong = f"stage {stage}: {unknown_name('parameter', error['where'], answer['known'])}"
+            raise Refused(f"{origin}: {wrong}")
+        stages[stage] = StageInfo(**answer)
+        _refuse_programs_of_scene(job, stage, stages[stage])
+    return replace(job, stages=stages)
 
 
 def _refuse_programs_of_scene(job: ResolvedJob, stage: str, info: StageInfo) -> None:
@@ -325,10 +324,3 @@ def _refuse_programs_of_scene(job: ResolvedJob, stage: str, info: StageInfo) -> 
                 f"{origin}: it names a program to run ({program!r:.80}), which a scene may not do; if you trust it, "
                 f'remove it there and give it by set="{stage}.{name}=..."'
             )
-
-
-def _refusal(stage: str, error: dict[str, Any], known: list[str]) -> str:
-    """Return the message for an error of `worker._error`; `known` has the dotted names of the stage's parameters."""
-    if error["unknown"]:
-        return f"stage {stage}: {unknown_name('parameter', error['where'], known)}"
-    return f"{stage}.{error['where']} = {error['value']}: {error['message']}"

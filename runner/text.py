@@ -1,5 +1,6 @@
-"""Formatting of errors, sizes, durations and paths as text for users."""
+"""Formatting of errors, sizes, durations, names and paths as text for users."""
 
+import difflib
 import errno
 import os
 from collections.abc import Iterable
@@ -48,3 +49,15 @@ def join_names(names: Iterable[str]) -> str:
 def display_path(path: Path) -> str:
     """Return a path as text: relative to the current folder if it lies inside this folder, else unchanged."""
     return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """Return the message for an unknown name, with the most similar known name or else all known names.
+
+    Args:
+        kind: what is named, e.g. "stage".
+        name: the unknown name.
+        known: the known names.
+    """
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")

@@ -1,7 +1,7 @@
 """The process that imports stages, started as `python -m runner.worker <command>`.
 
-The command is `describe` (answers questions about stages), `frames` (extracts the frames of a video) or `run` (runs a
-stage). Input is read from the standard input.
+The command is `describe` (answers questions about stages) or `run` (runs a stage). Input is read from the standard
+input.
 
 The description of a stage is a module with the class Params and optional functions (needed_weights, unavailable,
 optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
@@ -13,7 +13,6 @@ import faulthandler
 import importlib
 import json
 import os
-import platform
 import reprlib
 import resource
 import signal
@@ -31,7 +30,7 @@ from typing import Any, TextIO, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from runner.files import list_files
+from runner.files import MACHINE, list_files
 from runner.text import format_error
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -71,10 +70,12 @@ def describe() -> None:
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
-    path = description_file(stage)
+    path, own = description_file(stage), Path(f"stages/{stage}.py")
+    if not own.is_file():
+        return {"broken": f"{own}: no such file, and pipeline.yaml names it"}
     try:
         planned = import_file(path)
-        path = Path(f"stages/{stage}.py")
+        path = own
         _check_run(path, question["takes"])
     except Exception as error:
         return {"broken": f"{path}: {format_error(error)}"}  # the stage's code has an error
@@ -153,21 +154,6 @@ def _error(error: Any, model: type[BaseModel], known: list[str]) -> dict[str, An
     return {"where": where, "unknown": unknown, "value": reprlib.repr(value), "message": message}
 
 
-def frames() -> int:
-    """Extract the frames of a video. Prints a sentence about the result or the error, and returns the exit code.
-
-    Reads a JSON object: {"video": path, "folder": path of the folder to fill, "content": hash of the video}.
-    """
-    question = json.load(sys.stdin)
-    video = importlib.import_module("reffusion.capture.video_frames")
-    try:
-        print(video.extract_frames(Path(question["video"]), Path(question["folder"]), question["content"]))
-    except ValueError as error:
-        print(format_error(error))
-        return 1
-    return 0
-
-
 def run() -> int:
     """Run a stage, and return the exit code.
 
@@ -234,7 +220,7 @@ def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
         log.write(traceback.format_exc())
         return {"error": format_error(error)[:9999]}  # short enough for the buffer of a pipe
     seconds = round(time.perf_counter() - started, 2)
-    return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": platform.node()}
+    return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": MACHINE}
 
 
 def _end_with_runner(fd: int) -> None:
@@ -252,10 +238,11 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    code = {"describe": describe, "frames": frames, "run": run}[sys.argv[1]]()
-    if sys.argv[1] == "run":
+    if sys.argv[1] == "describe":
+        describe()
+    else:
+        code = run()
         # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code or 0)
-    sys.exit(code)
+        os._exit(code)

@@ -3,6 +3,8 @@
 The motion of the picture is measured by tracked corners, in widths of the picture. The motion since the first frame is
 called the *distance* of a frame. The distance of the last frame is divided into equal *windows*; each window gives at
 most one frame.
+
+The runner starts it as `python -m reffusion.capture.video_frames VIDEO FOLDER HASH`, see `extract_frames`.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -303,3 +306,11 @@ def _save_table(path: Path, seen: list[FrameStats], chosen: list[FrameStats], bl
         for each in seen:
             numbers = (f"{each.seconds:.3f}", f"{each.distance:.4f}", f"{each.sharpness:.4f}")
             writer.writerow((each.number, *numbers, what.get(each.number, LESS_SHARP)))
+
+
+if __name__ == "__main__":
+    try:
+        print(extract_frames(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]))
+    except ValueError as error:
+        print(" ".join(str(error).split()))
+        sys.exit(1)

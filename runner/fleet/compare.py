@@ -20,7 +20,7 @@ from runner.files import write_json
 from runner.fleet.engine import LocalEngine
 from runner.fleet.parallel import Outcome, SceneRun, run_all
 from runner.keys import HASHES, Hashes
-from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown_name
+from runner.pipeline import Pipeline, check_known, find_scene, load_pipeline
 from runner.process import PROJECT
 from runner.resolve import Request, resolve_all
 from runner.results import mean_scores
@@ -116,8 +116,8 @@ def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
     """Return the methods to run besides FULL: those in `only`, else `own` (the scene's own run) and all variants."""
     known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]  # FULL always runs
     methods = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
-    for name in (name for name in methods if name not in known):
-        raise Refused(f"variants: {unknown_name('variant', name, known)}")
+    for name in methods:
+        check_known("variants", "variant", name, known)
     return list(dict.fromkeys(methods)) if only else known
 
 

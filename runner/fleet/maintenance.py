@@ -14,9 +14,9 @@ from runner.artifacts import delete_folder, diff_artifact, recover_swap
 from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
 from runner.frames import FRAMES
 from runner.keys import HASHES, Hashes
-from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown_name
+from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline
 from runner.resolve import Request, check_unique_name
-from runner.text import display_path, join_names
+from runner.text import display_path, join_names, unknown_name
 
 # Files that the runner and report/ write to runs/<scene>/ besides artifacts.
 RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "before_after.webp", "check.png")
@@ -48,7 +48,9 @@ def verify(request: Request) -> int:
     Raises:
         Refused: the scene or the variant is unknown, or another process uses one of the folders.
     """
-    hashes, homes, damaged = Hashes(request.runs / HASHES, recompute=True), _homes(request), 0
+    cached, hashes = Hashes(request.runs / HASHES), Hashes(request.runs / HASHES)
+    hashes.known.clear()  # so that each file is hashed again
+    homes, damaged = _homes(request), 0
     for home in homes:
         with hold_lock(request.runs, home.name, shared=True, wait=False):
             for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
@@ -56,15 +58,15 @@ def verify(request: Request) -> int:
                 damaged += not diff or bool(diff.missing or diff.changed)
                 message = ", ".join(diff.describe()) if diff else f"{RECEIPT} cannot be read"
                 say(f"{display_path(folder)}: {message or 'as it was made'}")
-    del hashes.corrupt[:]  # the comparison with receipts has reported them
-    for scene in {request.root / source for home in homes if (source := read_text(home / "source"))}:
-        hashes.folder(scene)
-    for path in hashes.corrupt:
+    scenes = {request.root / source for home in homes if (source := read_text(home / "source"))}
+    corrupt = [path for scene in scenes for path in list_files(scene) if cached.file(path) != hashes.file(path)]
+    for path in corrupt:
         say(f"{display_path(path)}: its content changed, its size and time did not")
+    hashes.known = cached.known | hashes.known
     hashes.save()
-    if damaged + len(hashes.corrupt):
+    if damaged + len(corrupt):
         say(f"`make scene={request.scene} all` makes again what is missing or changed; keep=1: what is missing")
-    return damaged + len(hashes.corrupt)
+    return damaged + len(corrupt)
 
 
 def clean(request: Request) -> None:

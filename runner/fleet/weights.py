@@ -29,7 +29,8 @@ def fetch_weights(request: "Request", offline: bool) -> int:
     from runner.resolve import resolve  # not in the process of `fetch`, which may see another package reffusion
 
     job = resolve(request, scene=bool(request.scene))
-    answers = list(zip(job.stages, ask_stages(job.root, list(map(job.question, job.stages))), strict=True))
+    questions = {stage: job.weights_question(stage) for stage, info in job.stages.items() if not info.broken}
+    answers = list(zip(questions, ask_stages(job.root, list(questions.values())), strict=True))
     all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
     all_needs += [
         (f"{stage}, if asked for", need | {"optional": True})
@@ -51,7 +52,7 @@ def fetch_weights(request: "Request", offline: bool) -> int:
     if offline or not to_fetch:
         return unusable + sum(not need["optional"] for need in to_fetch)
     process = start_worker(request.root, module="runner.fleet.weights")
-    process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
+    process.communicate(json.dumps(questions))
     return unusable + process.returncode
 
 
