@@ -255,10 +255,8 @@ lint: $(VENV)/.ready-dev
 	$(PY) -m ruff format --check --quiet .
 	$(PY) -m mypy
 
-# slow=1 adds the rendering of 100,000 Gaussians and more.
 bench: $(VENV)/.ready
-	$(PY) -m lab.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
-	$(if $(slow),$(PY) -m lab.bench.large)
+	$(PY) -m lab.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate)
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m lab.stability --out="$${runs:-runs}/stability.json"
