@@ -48,6 +48,7 @@ from lab.studies.holes import (
     save_row,
     to_tensors,
 )
+from lab.studies.jobs import profile_params
 from lab.studies.scene_priors import run_study
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
@@ -60,8 +61,6 @@ from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
 from report.paired_statistics import confidence_half_width
 from stages import personalize as stage
-
-ROOT = Path(__file__).resolve().parents[2]
 
 TELEA_RADIUS = 5  # radius of both OpenCV methods, px
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
@@ -201,23 +200,6 @@ def _reduced(case: Case, size: int) -> Case:
     return Case(
         small, cv2.resize(case.hole.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 1e-4, case.kind
     )
-
-
-def profile_params(prior: str, settings: dict) -> stage.Params:
-    """Return the laptop profile's parameters of `personalize` for a prior.
-
-    Args:
-        prior: diffusers folder.
-        settings: dotted name of a parameter -> value that overrides the profile's.
-    """
-    values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    for name, value in {"prior": prior, **settings}.items():
-        *groups, last = name.split(".")
-        place = values
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
-    return stage.Params(**values)
 
 
 @torch.no_grad()
@@ -459,7 +441,7 @@ def main() -> None:
                 shown = {column: round(kinds[kind][column], 3) for column in COLUMNS}
                 print(name, kind, shown, "LPIPS over Telea's:", kinds[kind]["lpips_over_telea"], flush=True)
     if arguments.run:
-        params = profile_params(first, dict(arguments.set))
+        params = profile_params("personalize", "laptop", {"prior": first, **dict(arguments.set)})
         result["personalization"] = measure_personalization(
             params,
             arguments.run,

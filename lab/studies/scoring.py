@@ -25,6 +25,7 @@ from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
+from report import page
 
 MIN_ALPHA = 0.9  # a pixel is uncovered if its alpha is lower
 BLACK, LIT = 0.06, 0.15  # a pixel is uncovered too if its brightest channel is below BLACK and the truth's above LIT
@@ -230,7 +231,7 @@ def table(rows: list[dict]) -> str:
     variants = list(rows[0]["variants"]) if rows else []
     heads = [*PICTURES, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
     heads += [head for name in variants for head in (name, f"LPIPS, ours / {name}")]
-    lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+    lines = []
     for row in rows:
         cells = [_scores(row[way]) for way in PICTURES]
         cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
@@ -239,8 +240,8 @@ def table(rows: list[dict]) -> str:
         for each in row["variants"].values():
             ours, theirs = row["result"]["lpips_vgg"], each["lpips_vgg"]
             cells += [_scores(each), _number(ours / theirs if ours and theirs else None, 2)]
-        lines.append(f"| {row['place']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([row["place"], *cells])
+    return page.markdown_table(["place", *heads], lines)
 
 
 def _scores(of: dict[str, float | None]) -> str:
