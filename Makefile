@@ -222,7 +222,7 @@ runs/prior/photographs: | setup
 prior-report: data/demo/.generated setup
 	@$(RUN) run reference --scene demo --profile laptop
 	$(PY) -m lab.studies.prior --start 0.35 --steps 1 4 12 --run runs/demo --out runs/prior-report
-	$(PY) -m report.prior runs/prior-report
+	$(PY) -m lab.studies.prior_page runs/prior-report
 
 # Runs personalization and initialization first, where they are missing.
 sds-variance: ready

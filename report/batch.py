@@ -18,7 +18,7 @@ import cv2
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image
-from report import page
+from report import cli, page
 from report.compare import DIGITS, SHORT
 
 WIDTH = 240  # width of a picture, px
@@ -85,6 +85,7 @@ def _picture(home: Path, scene: str) -> str:
     return f'<img src="data:image/jpeg;base64,{base64.b64encode(data).decode()}" alt="{escape(scene)}">'
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion batch-page`: write the page of a batch, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion batch-page", description=__doc__.split("\n")[0])
@@ -92,10 +93,7 @@ def main() -> None:
     parser.add_argument("--variant", default="", help="of the scenes")
     arguments = parser.parse_args()
     end = f"@{arguments.variant}" if arguments.variant else ""
-    try:
-        print(make(arguments.runs / f"results{end}.json"))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.runs / f"results{end}.json"))
 
 
 if __name__ == "__main__":

@@ -103,13 +103,11 @@ def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
     return np.asarray(canvas)
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion check`: write check.png, and print the recorded warnings and the path."""
     home = cli.run_folder(cli.scene_parser("check", __doc__).parse_args())
-    try:
-        path, warnings = make(home)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    path, warnings = make(home)
     if (sfm := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
         print(load_json(sfm)["summary"])
     for line in warnings:

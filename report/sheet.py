@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
+from report import cli
 
 Item = TypeVar("Item")
 
@@ -129,6 +130,7 @@ def compose_sheet(cells: Sequence[Sequence[np.ndarray | None]], titles: list[str
     return np.asarray(canvas)
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion sheet`: write the contact sheet of a finished scene, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion sheet", description=__doc__.split("\n")[0])
@@ -138,10 +140,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="default: runs/<scene>/sheet.png")
     arguments = parser.parse_args()
     views = arguments.views if len(arguments.views) > 1 or not arguments.views[0].isdigit() else int(arguments.views[0])
-    try:
-        print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
 
 
 if __name__ == "__main__":

@@ -241,16 +241,14 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion view`: serve the viewer of one scene until Ctrl-C, and print its address."""
     parser = cli.scene_parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
     access = Access(arguments.port)
-    try:
-        window = Viewer(cli.run_folder(arguments), arguments.port, access)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    window = Viewer(cli.run_folder(arguments), arguments.port, access)
     print(f"{access.link(f'http://127.0.0.1:{window.server.get_port()}/')}  (Ctrl-C ends)", flush=True)
     try:
         window.server.sleep_forever()

@@ -11,9 +11,9 @@ import pytest
 from lab.prior import images
 from lab.studies import holes
 from lab.studies import prior as benchmark
+from lab.studies import prior_page as page
 from reffusion.io.images import load_image, save_image
 from reffusion.metrics import image_metrics
-from report import prior as page
 
 pytestmark = pytest.mark.integration
 

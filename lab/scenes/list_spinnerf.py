@@ -9,15 +9,14 @@ import argparse
 from pathlib import Path
 
 from reffusion.capture import spinnerf_scenes
+from report import cli
 
 
+@cli.command
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
-    try:
-        print("\n".join(spinnerf_scenes.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print("\n".join(spinnerf_scenes.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
 
 
 if __name__ == "__main__":

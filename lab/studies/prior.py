@@ -18,7 +18,7 @@ Measurements and options:
   --wrong-reference   repeat with a wrong reference, which must not help: a picture in place of the reference, or
                 another scene's run, whose personalized prior is used as it is
 
-The study writes prior.json and rows of pictures to --out; `python -m report.prior` makes a page of them
+The study writes prior.json and rows of pictures to --out; `python -m lab.studies.prior_page` makes a page of them
 (`make prior-report` does both). Every draw is seeded. LPIPS needs the network's weights (`make weights`).
 """
 
