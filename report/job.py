@@ -28,6 +28,7 @@ from report import (
     verdict,
 )
 from report.job_data import JobFiles, load_job
+from report.sheet import scene_home
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
@@ -135,7 +136,7 @@ def advice_section(job: JobFiles) -> list[str]:
     It has what the user can paint or mark (`verdict.give_advice`), notes on the frames of a video and on structure
     from motion, and the warnings of all stages.
     """
-    record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
+    record = scene_home(job.home) / "frames" / "frames.json"
     lines = verdict.give_advice(job) + ([load_json(record)["said"]] if record.is_file() else [])
     if "poses" in job.folders:
         sfm = job.folders["poses"] / "sfm.json"
