@@ -12,7 +12,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     Args:
         brings: the keys of scene.yaml and the names of the scene's folders; not used here.
     """
-    painting = painters.weights_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
+    painting = painters.inpainter_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
     return [local.lpips_need(), *painting]
 
 

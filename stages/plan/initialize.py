@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.params.initialize import Params
+from reffusion.params.inpainter import SEED_KINDS
 from reffusion.weights import local, painters
 from reffusion.weights.published import DEPTH_ANYTHING, PAINTERS
 
@@ -18,7 +19,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
         brings: the keys of scene.yaml and the names of the scene's folders; not used here.
     """
     needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
-    return needs + (painters.weights_needs(params.inpainter, "initialize.inpainter") if params.extra_views else [])
+    return needs + (painters.inpainter_needs(params.inpainter, "initialize.inpainter") if _paints(params) else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
@@ -32,7 +33,12 @@ def machine_facts(params: Params) -> dict[str, str]:
     If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if no extra
     views are completed, or if the parameters name an inpainter that has no file.
     """
-    return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
+    return painters.inpainter_facts(params.inpainter) if _paints(params) else {}
+
+
+def _paints(params: Params) -> bool:
+    """Return whether the inpainter completes extra views; those of `SEED_KINDS` leave them to patches."""
+    return bool(params.extra_views) and params.inpainter.kind not in SEED_KINDS
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:

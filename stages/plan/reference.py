@@ -31,12 +31,12 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
         return []
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, params.dtype)]
-    return painters.reference_needs(params.inpainter, params.dtype)
+    return painters.inpainter_needs(params.inpainter, "reference.inpainter", params.dtype)
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """Return the weights of all inpainters from which `inpainter: auto` selects, whatever the parameters are."""
-    return [need for kind in PAINTERS for need in painters.weights_needs(Inpainter(kind=kind))]
+    return [need for kind in PAINTERS for need in painters.inpainter_needs(Inpainter(kind=kind))]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
@@ -45,7 +45,7 @@ def machine_facts(params: Params) -> dict[str, str]:
     If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
     parameters name an inpainter that has no file of its own, such as the diffusion prior.
     """
-    return painters.reference_facts(params.inpainter)
+    return painters.inpainter_facts(params.inpainter)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
