@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lab.studies.jobs import profile_params
+from lab.studies import jobs
 from lab.studies.scene_priors import run_study
 from reffusion import trace
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
@@ -25,8 +25,6 @@ from reffusion.distill.loop import average, build_objective, masked_factors, tak
 from reffusion.distill.terms.term import TermInputs
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
-from reffusion.io.ground_truth import load_ground_truth, load_object_mask
-from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
@@ -63,25 +61,12 @@ ATTEMPTS: dict[str, dict] = {
 def attempt_params(overrides: dict) -> Params:
     """Return the laptop profile's parameters of `distill` with SDS, changed by the overrides of an attempt."""
     changes = {name: value for name, value in overrides.items() if name != BASE}
-    return profile_params("distill", "laptop", {"sds.run": "always", **changes})
+    return jobs.profile_params("distill", "laptop", {"sds.run": "always", **changes})
 
 
 def load_test_views(run: Path) -> list[tuple]:
-    """Load `VIEWS` evenly spread test views of a run as (camera, truth uint8 [H, W, 3], box of the mask).
-
-    Raises:
-        ValueError: no test view has ground truth and a mask.
-    """
-    scene, views = load_scene(run / "poses"), []
-    for name in scene.test:
-        camera = scene.cameras[name]
-        truth = load_ground_truth(camera, run / "poses")
-        box = image_metrics.mask_box(load_object_mask(camera, run / "raw_masks", run / "masks"))
-        if truth is not None and box is not None:
-            views.append((camera, truth, box))
-    if not views:
-        raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    return [views[place] for place in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)]
+    """Load `VIEWS` test views of a run as (camera, truth uint8 [H, W, 3], box of the mask); errors as of `jobs`."""
+    return [(camera, truth, image_metrics.mask_box(mask)) for camera, truth, mask in jobs.load_test_views(run, VIEWS)]
 
 
 @torch.no_grad()

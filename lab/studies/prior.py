@@ -48,11 +48,10 @@ from lab.studies.holes import (
     save_row,
     to_tensors,
 )
-from lab.studies.jobs import profile_params
+from lab.studies.jobs import load_test_views, profile_params
 from lab.studies.scene_priors import run_study
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
-from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_references, load_scene
 from reffusion.params.base import Prompts, Settings
@@ -168,18 +167,11 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
     Raises:
         ValueError: no test view has ground truth and a mask.
     """
-    scene = load_scene(run / "poses")
-    cases = {}
-    for name in scene.test:
-        truth = load_ground_truth(scene.cameras[name], run / "poses")
-        hole = load_object_mask(scene.cameras[name], run / "raw_masks", run / "masks")
-        if truth is not None and hole.any():
-            cases[name] = Case(truth if pictures is None else pictures[name], hole, name)
-    if not cases:
-        raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    places = np.linspace(0, len(cases) - 1, min(VIEWS, len(cases))).round().astype(int)
-    chosen = [list(cases.values())[place] for place in places]
-    reference = load_references(run / "reference", scene)[0]
+    chosen = [
+        Case(truth if pictures is None else pictures[camera.name], hole, camera.name)
+        for camera, truth, hole in load_test_views(run, VIEWS)
+    ]
+    reference = load_references(run / "reference", load_scene(run / "poses"))[0]
     own = _reduced(Case(reference.image, reference.mask, reference.camera.name), size)
     whole, windows = [_reduced(case, size) for case in chosen], []
     for case in chosen:
