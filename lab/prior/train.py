@@ -252,7 +252,6 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-@cli.command
 def main() -> None:
     options = arguments()
     torch.set_num_threads(options.threads)
@@ -291,4 +290,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    cli.command(main)()
