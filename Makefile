@@ -222,7 +222,7 @@ runs/prior/photographs: | setup
 prior-report: data/demo/.generated setup
 	@$(RUN) run reference --scene demo --profile laptop
 	$(PY) -m lab.studies.prior --start 0.35 --steps 1 4 12 --run runs/demo --out runs/prior-report
-	$(PY) -m report.prior runs/prior-report
+	$(PY) -m lab.studies.prior_page runs/prior-report
 
 # Runs personalization and initialization first, where they are missing.
 sds-variance: ready
@@ -255,10 +255,8 @@ lint: $(VENV)/.ready-dev
 	$(PY) -m ruff format --check --quiet .
 	$(PY) -m mypy
 
-# slow=1 adds the rendering of 100,000 Gaussians and more.
 bench: $(VENV)/.ready
-	$(PY) -m lab.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
-	$(if $(slow),$(PY) -m lab.bench.large)
+	$(PY) -m lab.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate)
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m lab.stability --out="$${runs:-runs}/stability.json"

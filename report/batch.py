@@ -9,19 +9,16 @@ python -m report.batch --runs runs
 from __future__ import annotations
 
 import argparse
-import base64
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image
-from report import page
+from report import cli, inline_images, page
 from report.compare import DIGITS, SHORT
 
-WIDTH = 240  # width of a picture, px
+LONGEST = 240  # longer side of a picture, px
 MAX_PICTURES = 200  # more pictures would make a page of tens of MB
 
 
@@ -74,17 +71,14 @@ def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool)
 
 
 def _picture(home: Path, scene: str) -> str:
-    """Return the result's first rendered view by name, `WIDTH` px wide, as an `img` element; "" if there is none."""
+    """Return the result's first rendered view by name, reduced to `LONGEST` px, as an `img` element; "" without one."""
     first = next(iter(sorted((home / "evaluate" / "renders").glob("*.png"))), None)
     if first is None:
         return ""
-    image = load_image(first)
-    size = WIDTH, max(1, round(WIDTH * image.shape[0] / image.shape[1]))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    return f'<img src="data:image/jpeg;base64,{base64.b64encode(data).decode()}" alt="{escape(scene)}">'
+    return f'<img src="{inline_images.photo_address(load_image(first), LONGEST)}" alt="{escape(scene)}">'
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion batch-page`: write the page of a batch, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion batch-page", description=__doc__.split("\n")[0])
@@ -92,10 +86,7 @@ def main() -> None:
     parser.add_argument("--variant", default="", help="of the scenes")
     arguments = parser.parse_args()
     end = f"@{arguments.variant}" if arguments.variant else ""
-    try:
-        print(make(arguments.runs / f"results{end}.json"))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.runs / f"results{end}.json"))
 
 
 if __name__ == "__main__":

@@ -8,12 +8,10 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
-from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size, load_image
-from reffusion.io.scene import has_object_mask
 from report import inline_images, page
 from report.job_data import JobFiles
-from report.results import load_view_scores
+from report.results import load_view_scores, shows_object
 
 MEGABYTES = 3.0  # approximate size of all pictures together
 MIN_SIDE, MAX_SIDE = 320, 960  # longer side of a picture, px
@@ -126,14 +124,11 @@ def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
         job: a job whose stage `evaluate` is done.
         name: name of the view.
     """
-    evaluate = job.folders["evaluate"]
-    poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
+    evaluate, poses = job.folders["evaluate"], job.folders.get("poses", Path())
     paths = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
-    views = poses / "views.json"
-    if views.is_file():
-        shows_object = has_object_mask(raw_masks, job.folders.get("masks"), name)
-        clean = name in load_json(views)["test"] and not shows_object
-        paths["truth" if clean else "photograph"] = poses / "images" / f"{name}.png"
+    if (poses / "views.json").is_file():
+        kind = "photograph" if shows_object(job.folders, name) else "truth"
+        paths[kind] = poses / "images" / f"{name}.png"
     return {kind: path for kind, path in paths.items() if path.is_file()}
 
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_image, resize_nearest, save_image
 from reffusion.io.scene import has_photograph, load_warnings, raw_mask_files
 from report import cli, sheet
 
-WIDTH, HEIGHT, GAP = 240, 180, 4  # largest width and height of a picture, and the gap between pictures, px
+WIDTH, HEIGHT = 240, 180  # largest width and height of a picture, px
 COLUMNS = 6
 TINT = (255, 0, 160)  # color of the training views' masks; masks for scoring test views get the complementary color
 
@@ -35,14 +34,15 @@ def make(home: Path) -> tuple[Path, list[str]]:
     """
     poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
     if not (poses / "views.json").is_file() or not raw_masks.is_dir():
-        raise ValueError(f"{raw_masks} is missing; run `make scene={home.name.split('@')[0]} raw_masks` first")
+        raise ValueError(f"{raw_masks} is missing; run `make scene={sheet.scene_home(home).name} raw_masks` first")
     views = load_json(poses / "views.json")
     known = {*views["train"], *views["test"], *views.get("outliers", ())}
     names = [name for name in sorted(known) if has_photograph(poses, name)]
     if not names:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
-    cells = [(name, overlay_masks(poses, raw_masks, name), view_role(name, views)) for name in names]
-    save_image(home / "check.png", contact_sheet(cells))
+    pictures = [overlay_masks(poses, raw_masks, name) for name in names]
+    titles = [f"{name[:28]}  {view_role(name, views)}" for name in names]
+    save_image(home / "check.png", sheet.arrange(pictures, titles, COLUMNS))
     folders = (poses, raw_masks, sheet.stage_folder(home, "masks"))
     return home / "check.png", [line for folder in folders for line in load_warnings(folder)]
 
@@ -84,32 +84,11 @@ def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     return small
 
 
-def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
-    """Return one image, uint8 [H, W, 3], with all pictures in rows on white and a caption below each picture.
-
-    Args:
-        cells: (view name, picture uint8 [h, w, 3] of at most `WIDTH` x `HEIGHT` px, role); the caption has the first 28
-            characters of the name, and the role.
-    """
-    font, line = ImageFont.load_default(13), 20
-    columns = min(COLUMNS, len(cells))
-    rows = -(-len(cells) // columns)
-    canvas = Image.new("RGB", (columns * (WIDTH + GAP) + GAP, rows * (HEIGHT + GAP + line) + GAP), "white")
-    draw = ImageDraw.Draw(canvas)
-    for index, (name, picture, kind) in enumerate(cells):
-        left, top = GAP + index % columns * (WIDTH + GAP), GAP + index // columns * (HEIGHT + GAP + line)
-        canvas.paste(Image.fromarray(picture), (left, top))
-        draw.text((left, top + HEIGHT + 2), f"{name[:28]}  {kind}", "black", font)
-    return np.asarray(canvas)
-
-
+@cli.command
 def main() -> None:
     """Run `reffusion check`: write check.png, and print the recorded warnings and the path."""
     home = cli.run_folder(cli.scene_parser("check", __doc__).parse_args())
-    try:
-        path, warnings = make(home)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    path, warnings = make(home)
     if (sfm := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
         print(load_json(sfm)["summary"])
     for line in warnings:

@@ -1,12 +1,30 @@
-"""Command-line arguments shared by the commands that make a page of one scene."""
+"""What commands share: the arguments of those that make a page of one scene, and how a refusal is told."""
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from reffusion.command import root, scene_name, scene_path
+
+Result = TypeVar("Result")
+
+
+def command(main: Callable[[], Result]) -> Callable[[], Result]:
+    """Return `main` as a command, which a ValueError ends with its message in one line; a decorator."""
+
+    @functools.wraps(main)
+    def run() -> Result:
+        try:
+            return main()
+        except ValueError as error:
+            raise SystemExit(f"error: {error}") from None
+
+    return run
 
 
 def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:

@@ -328,6 +328,7 @@ def html(comparison: Comparison, table: list[dict], chart_paths: dict[str, Path 
     return page.document(title, [*body, page.heading("Notes"), page.bullets(table_notes(comparison, table))])
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion compare-page`: write table and page of a comparison; print the summary and the paths."""
     parser = argparse.ArgumentParser(prog="reffusion compare-page", description=__doc__.split("\n")[0])
@@ -336,11 +337,8 @@ def main() -> None:
     what.add_argument("--data", type=Path, help="the folder whose scenes were compared last")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
-    try:
-        name = cli.name_scene(arguments.scene) if arguments.scene else FOLDER_COMPARISON
-        paths = make(home := arguments.runs / name)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    name = cli.name_scene(arguments.scene) if arguments.scene else FOLDER_COMPARISON
+    paths = make(home := arguments.runs / name)
     print(terminal_text(load_comparison(home)), *paths.values(), sep="\n")
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
-from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
-from reffusion.io.scene import has_object_mask
-from report.results import FULL, Comparison, Run
-from report.sheet import GAP, enlarge, pick_evenly
+from report.results import FULL, Comparison, Run, shows_object
+from report.sheet import arrange, enlarge, pick_evenly
 
 WIDTH = 1920  # approximate width of a sheet, px
 CONTEXT = 0.15  # margin of the crop on each side, as a share of the box's width or height
@@ -58,12 +55,10 @@ def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count
 def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray]]:
     """Return (title, picture cropped to the box) of the photograph and of each run, as far as they exist."""
     poses = first.folders.get("poses", Path())
-    photo, views = poses / "images" / f"{view}.png", poses / "views.json"
-    cells = []
-    if photo.exists() and views.exists():
-        raw_masks, masks = (first.folders.get(stage) for stage in ("raw_masks", "masks"))
-        with_object = view not in load_json(views)["test"] or (raw_masks and has_object_mask(raw_masks, masks, view))
-        cells.append(("ground truth" if not with_object else "photograph, with the object", load_image(photo)))
+    photo, cells = poses / "images" / f"{view}.png", []
+    if photo.exists() and (poses / "views.json").exists():
+        title = "photograph, with the object" if shows_object(first.folders, view) else "ground truth"
+        cells.append((title, load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"
         if path.exists():
@@ -102,20 +97,7 @@ def arrange_crops(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
         cells: pictures of about one size, uint8 [h, w, 3], which are enlarged by a whole factor.
         titles: one per picture, of one line or of two lines separated by a newline.
     """
-    height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
-    columns = min(len(cells), 4)
+    width, columns = max(cell.shape[1] for cell in cells), min(len(cells), 4)
     scale = max(1, round(WIDTH / columns / width))
     size = max(13, min(26, width * scale // 14))
-    below = round(1.2 * size) if any("\n" in title for title in titles) else 0  # room for a second line
-    font, head = ImageFont.load_default(size), round(1.8 * size) + below
-    step = width * scale + 2 * GAP, height * scale + head + GAP
-    rows = -(-len(cells) // columns)
-    canvas = Image.new("RGB", (columns * step[0] - 2 * GAP, rows * step[1] - GAP), "white")
-    draw = ImageDraw.Draw(canvas)
-    for index, (cell, title) in enumerate(zip(cells, titles, strict=True)):
-        left, top = index % columns * step[0], index // columns * step[1]
-        name, _, score = title.partition("\n")
-        draw.text((left, top + head - size // 3), score, "#666", font, anchor="ls")
-        draw.text((left, top + head - size // 3 - below), name, "black", font, anchor="ls")
-        canvas.paste(Image.fromarray(enlarge(cell, scale)), (left, top + head))
-    return np.asarray(canvas)
+    return arrange([enlarge(cell, scale) for cell in cells], titles, columns, size)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
-from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask
 from report import page
 from report.job_data import JobFiles
@@ -50,9 +49,7 @@ def view_shares(job: JobFiles) -> dict[str, tuple[float, float, float | None]]:
         The first two are computed from the masks on disk, the last one is read from the facts of the stage `initialize`
         and None before this stage. The dictionary is empty before the stage `masks`.
     """
-    masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
-    facts = folder / "facts.json"
-    open_ = load_json(facts).get("uncovered", {}) if "initialize" in job.folders and facts.is_file() else {}
+    masks, open_ = job.folders.get("masks", Path()), job.facts("initialize").get("uncovered", {})
     shares = {}
     for path in sorted((masks / "consistent").glob("*.png")) if "masks" in job.folders else ():
         hidden, invent = load_mask(path), load_mask(masks / "invent" / path.name)

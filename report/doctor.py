@@ -97,7 +97,7 @@ def find_problem(key: str) -> str | None:
         source = root() / EMBEDDED if key == "embedded" else PRIORS[key]
         problem = local.model_need(source, "float32").problem
     else:
-        problem = painters.reference_needs(Inpainter(kind=key), "float32")[0].problem
+        problem = painters.inpainter_needs(Inpainter(kind=key), "reference.inpainter")[0].problem
     return f"`{FETCHED_BY[key]}` fetches it" if problem and ABSENT in problem and key in FETCHED_BY else problem
 
 

@@ -108,15 +108,13 @@ def viewer_caveats(path: Path, antialiased: bool) -> str:
     return doubles + smoothed
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion export`: write the finished scene in all formats, and print what was written."""
     parser = cli.scene_parser("export", __doc__)
     parser.add_argument("--sog", action="store_true", help="also write .sog and .html, by Node's npm (210 MB, minutes)")
     arguments = parser.parse_args()
-    try:
-        print("\n".join(make(cli.run_folder(arguments), arguments.sog)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print("\n".join(make(cli.run_folder(arguments), arguments.sog)))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from report import (
     verdict,
 )
 from report.job_data import JobFiles, load_job
+from report.sheet import scene_home
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
@@ -135,7 +136,7 @@ def advice_section(job: JobFiles) -> list[str]:
     It has what the user can paint or mark (`verdict.give_advice`), notes on the frames of a video and on structure
     from motion, and the warnings of all stages.
     """
-    record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
+    record = scene_home(job.home) / "frames" / "frames.json"
     lines = verdict.give_advice(job) + ([load_json(record)["said"]] if record.is_file() else [])
     if "poses" in job.folders:
         sfm = job.folders["poses"] / "sfm.json"
@@ -259,6 +260,7 @@ def files_section(job: JobFiles) -> list[str]:
     return [page.heading("Files"), page.links(targets)]
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion report`: write the report of a scene, or of all scenes in a folder, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion report", description=__doc__.split("\n")[0])
@@ -269,17 +271,14 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     suffix = f"@{arguments.variant}" if arguments.variant else ""
-    try:
-        if arguments.scene:
-            print(make(cli.run_folder(arguments)))
-            return
-        folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
-        homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]
-        if not homes:
-            raise ValueError(f"data={arguments.data}: none of its scenes has a folder in {arguments.runs}")
-        print(scenes_page.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    if arguments.scene:
+        print(make(cli.run_folder(arguments)))
+        return
+    folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
+    homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]
+    if not homes:
+        raise ValueError(f"data={arguments.data}: none of its scenes has a folder in {arguments.runs}")
+    print(scenes_page.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
 
 
 if __name__ == "__main__":

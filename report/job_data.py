@@ -50,6 +50,11 @@ class JobFiles:
     unread: tuple[str, ...]
     metrics: dict[str, Any]
 
+    def facts(self, stage: str) -> dict[str, Any]:
+        """Return the facts.json of a stage; {} if the stage is not done or has none."""
+        path = self.folders.get(stage, Path()) / "facts.json"
+        return load_json(path) if stage in self.folders and path.is_file() else {}
+
 
 def load_job(home: Path) -> JobFiles:
     """Load the job in runs/<scene> or runs/<scene>@<variant>.

@@ -124,7 +124,7 @@ def references_section(job: JobFiles) -> list[str]:
     top = page.heading("References")
     if "reference" not in job.folders:
         return [top, page.paragraph("None: the stage `reference` has not run, or was left out.")]
-    facts = _facts(folder)
+    facts = job.facts("reference")
     parts = [top]
     for path in sorted((folder / "references").glob("*.png")):
         name, picture = path.stem, load_image(path)
@@ -150,11 +150,6 @@ def references_section(job: JobFiles) -> list[str]:
     return [*parts, *extra_views_section(job), *origins_section(job)]
 
 
-def _facts(folder: Path) -> dict:
-    """Return the facts.json in the folder of a stage; {} without this file."""
-    return load_json(folder / "facts.json") if (folder / "facts.json").is_file() else {}
-
-
 def _origin(facts: dict, folder: Path, name: str) -> str:
     """Return in words where a reference comes from and, if given, how it fits; `facts` is the stage's facts.json."""
     if name in facts.get("given", ()):
@@ -170,7 +165,7 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
 def extra_views_section(job: JobFiles) -> list[str]:
     """Return HTML parts with the extra views and the reason for them; empty if there are none."""
     folder = job.folders.get("initialize", Path())
-    shares = _facts(folder).get("extra_views", {}) if "initialize" in job.folders else {}
+    shares = job.facts("initialize").get("extra_views", {})
     if not shares:
         return []
     reason = "No reference shows these places, so these views were completed from patches of the photographs."
@@ -187,7 +182,7 @@ def extra_views_section(job: JobFiles) -> list[str]:
 def origins_section(job: JobFiles) -> list[str]:
     """Return HTML parts with the origin of what views show in the hole; empty before the stage `initialize`."""
     folder = job.folders.get("initialize", Path())
-    facts = _facts(folder) if "initialize" in job.folders else {}
+    facts = job.facts("initialize")
     shares, invented = facts.get("origins", {}), facts.get("invented_shares", {})
     names = sorted(path.stem for path in (folder / "origins").glob("*.png")) if shares else []
     if not names or "poses" not in job.folders:

@@ -22,6 +22,7 @@ def runner_options(arguments: argparse.Namespace) -> tuple[str, ...]:
     return tuple(word for name, value in options.items() if value for word in (name, value))
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion mask`: run the stages up to `raw_masks`, then serve the page until Ctrl-C."""
     parser = cli.scene_parser("mask", __doc__)
@@ -36,10 +37,7 @@ def main() -> None:
     if status := subprocess.run(make_command(*words, "--set", WITHOUT_MASKS)).returncode:
         raise SystemExit(status)
     app = App(arguments.runs.resolve(), options, cli.typed_command("mask", arguments.scene))
-    try:
-        serve(app, app.open(str(arguments.scene)).name, arguments.port)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    serve(app, app.open(str(arguments.scene)).name, arguments.port)
 
 
 def serve(app: App, scene: str, port: int) -> None:

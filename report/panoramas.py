@@ -13,18 +13,17 @@ from reffusion.capture.layouts.capture import find_image_folder, find_pictures
 from reffusion.capture.layouts.panoramas import IMAGE_FOLDERS
 from reffusion.capture.video_frames import extract_frames
 from reffusion.command import root, scene_path
+from report import cli
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion panoramas`: cut panoramas into views, and print what was written."""
     parser = argparse.ArgumentParser(prog="reffusion panoramas", description=__doc__.split("\n")[0])
     parser.add_argument("scene", help="folder of panoramas, or a video of them; the name or path of a scene")
     parser.add_argument("--out", type=Path, help="folder to write; otherwise that of the scene, with -views at its end")
     arguments = parser.parse_args()
-    try:
-        print(make(arguments.scene, arguments.out))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.scene, arguments.out))
 
 
 def make(scene: str, out: Path | None) -> str:

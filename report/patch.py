@@ -38,6 +38,7 @@ def make(home: Path) -> str:
     )
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion patch`: fill the hole of a scene or of two files of splats, and print what was written."""
     parser = cli.scene_parser("patch", __doc__, needs_scene=False)
@@ -52,17 +53,14 @@ def main() -> None:
     parser.add_argument("--budget", help="as for `run`")
     parser.add_argument("--set", default="", help="as for `run`")
     arguments = parser.parse_args()
-    try:
-        if arguments.files:
-            print(patch_files.make(arguments))
-        elif arguments.scene is None:
-            raise ValueError("name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply")
-        elif arguments.only_check:
-            require_deleted(cli.run_folder(arguments))
-        else:
-            print(make(cli.run_folder(arguments)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    if arguments.files:
+        print(patch_files.make(arguments))
+    elif arguments.scene is None:
+        raise ValueError("name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply")
+    elif arguments.only_check:
+        require_deleted(cli.run_folder(arguments))
+    else:
+        print(make(cli.run_folder(arguments)))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from reffusion.io.arrays import load_json
+from reffusion.io.scene import has_object_mask
 from report.paired_statistics import Difference, confidence_half_width, paired_difference
 
 FULL = "full"
@@ -163,6 +164,17 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
         load_json(metrics) if metrics.is_file() else {},
         load_view_scores(evaluate / "per_view.csv"),
     )
+
+
+def shows_object(folders: dict[str, Path], view: str) -> bool:
+    """Return whether a view's photograph shows the object: unless it is a test view without an object's mask.
+
+    Args:
+        folders: stage -> folder with the stage's results; `poses` is among them.
+        view: name of the view.
+    """
+    is_test = view in load_json(folders["poses"] / "views.json")["test"]
+    return not is_test or has_object_mask(folders.get("raw_masks", Path()), folders.get("masks"), view)
 
 
 def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:

@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
+from report import cli
 
 Item = TypeVar("Item")
 
@@ -68,6 +69,11 @@ def pick_evenly(items: list[Item], count: int) -> list[Item]:
     return [items[int(place)] for place in places]
 
 
+def scene_home(home: Path) -> Path:
+    """Return the folder of the scene's own run, runs/<scene>, also for that of a variant, runs/<scene>@<variant>."""
+    return home.with_name(home.name.split("@")[0])
+
+
 def stage_folder(scene_dir: Path, stage: str) -> Path:
     """Return the folder of a stage; for a variant that has no such folder, the folder of the scene's own run.
 
@@ -77,7 +83,7 @@ def stage_folder(scene_dir: Path, stage: str) -> Path:
         scene_dir: runs/<scene> or runs/<scene>@<variant>.
     """
     own = scene_dir / stage
-    return own if own.exists() else scene_dir.with_name(scene_dir.name.split("@")[0]) / stage
+    return own if own.exists() else scene_home(scene_dir) / stage
 
 
 def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
@@ -129,6 +135,33 @@ def compose_sheet(cells: Sequence[Sequence[np.ndarray | None]], titles: list[str
     return np.asarray(canvas)
 
 
+def arrange(pictures: Sequence[np.ndarray], titles: Sequence[str], columns: int, size: int = 13) -> np.ndarray:
+    """Return one image, uint8 [H, W, 3], with pictures in rows on white, each below its title.
+
+    Args:
+        pictures: uint8 [h, w, 3], of about one size.
+        titles: one per picture, of one line or of two lines separated by a newline; the second line is gray.
+        columns: largest number of pictures in a row.
+        size: size of the font, px.
+    """
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    columns = min(len(pictures), columns)
+    below = round(1.2 * size) if any("\n" in title for title in titles) else 0  # room for a second line
+    font, head = ImageFont.load_default(size), round(1.8 * size) + below
+    step = width + 2 * GAP, height + head + GAP
+    rows = -(-len(pictures) // columns)
+    canvas = Image.new("RGB", (columns * step[0] - 2 * GAP, rows * step[1] - GAP), "white")
+    draw = ImageDraw.Draw(canvas)
+    for index, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
+        left, top = index % columns * step[0], index // columns * step[1]
+        first, _, second = title.partition("\n")
+        draw.text((left, top + head - size // 3), second, "#666", font, anchor="ls")
+        draw.text((left, top + head - size // 3 - below), first, "black", font, anchor="ls")
+        canvas.paste(Image.fromarray(picture), (left, top + head))
+    return np.asarray(canvas)
+
+
+@cli.command
 def main() -> None:
     """Run `reffusion sheet`: write the contact sheet of a finished scene, and print its path."""
     parser = argparse.ArgumentParser(prog="reffusion sheet", description=__doc__.split("\n")[0])
@@ -138,10 +171,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="default: runs/<scene>/sheet.png")
     arguments = parser.parse_args()
     views = arguments.views if len(arguments.views) > 1 or not arguments.views[0].isdigit() else int(arguments.views[0])
-    try:
-        print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
 
 
 if __name__ == "__main__":

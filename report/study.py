@@ -187,6 +187,7 @@ def _save_reference(run: Run, out: Path, name: str) -> str | None:
     return f"clips/{name}.png"
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion study`: write the page, the clips and the key of a study, and print the path of the page."""
     parser = argparse.ArgumentParser(prog="reffusion study", description=__doc__.split("\n")[0])
@@ -200,10 +201,7 @@ def main() -> None:
         parser.error("--scene or --data: of which comparison?")
     methods = [method for method in arguments.variants.split(",") if method]
     name = cli.name_scene(arguments.scene) if arguments.scene else FOLDER_COMPARISON
-    try:
-        print(make(arguments.runs / name, methods, arguments.seed))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(arguments.runs / name, methods, arguments.seed))
 
 
 if __name__ == "__main__":

@@ -123,6 +123,7 @@ def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> 
         writer.release()
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion turntable`: write the video, or that of before and after, and print its path."""
     parser = cli.scene_parser("turntable", __doc__)
@@ -130,10 +131,7 @@ def main() -> None:
         "--before-after", action="store_true", help="a video and an animated picture of before and after"
     )
     arguments = parser.parse_args()
-    try:
-        print((make_wipe if arguments.before_after else make)(cli.run_folder(arguments)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print((make_wipe if arguments.before_after else make)(cli.run_folder(arguments)))
 
 
 if __name__ == "__main__":

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
-from reffusion.io.arrays import load_json
 from report.job_data import JobFiles
 
 MIN_INVENTION = 0.005  # share of the hole below which nothing counts as invented
@@ -59,7 +57,7 @@ def give_advice(job: JobFiles) -> list[str]:
 
 def describe_removal(job: JobFiles) -> str:
     """Return whether the object is gone, by the parts of it that the stage `masks` found and left in the scene."""
-    remnants = _facts(job, "masks").get("remnants")
+    remnants = job.facts("masks").get("remnants")
     if remnants is None or not job.receipts["masks"]["params"].get("remnants"):
         return "What the masks cover is removed."
     left = [each for each in remnants if not each["removed"]]
@@ -77,7 +75,7 @@ def measure_invention(job: JobFiles) -> float | None:
     """
     if "initialize" not in job.folders:
         return None
-    origins = _facts(job, "initialize").get("origins")
+    origins = job.facts("initialize").get("origins")
     if origins is None:
         return None
     return origins["patches"] + origins["nothing"] + (0.0 if is_reference_given(job) else origins["reference"])
@@ -85,7 +83,7 @@ def measure_invention(job: JobFiles) -> float | None:
 
 def is_reference_given(job: JobFiles) -> bool:
     """Return whether the user gave a picture of what is behind the object."""
-    return bool(_facts(job, "reference").get("given"))
+    return bool(job.facts("reference").get("given"))
 
 
 def rank_views(job: JobFiles) -> list[tuple[str, float, bool]]:
@@ -101,9 +99,3 @@ def rank_views(job: JobFiles) -> list[tuple[str, float, bool]]:
 def view_to_paint(job: JobFiles) -> str | None:
     """Return the name of the first unpainted view that adds at least `LEAST_GAIN` of the hole; None without one."""
     return next((name for name, share, painted in rank_views(job) if not painted and share >= LEAST_GAIN), None)
-
-
-def _facts(job: JobFiles, stage: str) -> dict[str, Any]:
-    """Return the facts.json of a stage; {} if the stage is not done or has none."""
-    path = job.folders.get(stage, Path()) / "facts.json"
-    return load_json(path) if stage in job.folders and path.is_file() else {}

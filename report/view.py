@@ -21,7 +21,7 @@ from reffusion.types import Camera, Gaussians, Scene
 from report import camera_path, cli, unseen_overlay
 from report.access import Access
 from report.gaussian_layers import finish_command, load_layers
-from report.sheet import stage_folder
+from report.sheet import scene_home, stage_folder
 from report.viewer_server import start_viewer_server
 
 PORT = 8080
@@ -56,11 +56,6 @@ def render_picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """Render Gaussians from a camera as uint8 [H, W, 3]."""
     with RENDER_LOCK:
         return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
-
-
-def scene_home(home: Path) -> Path:
-    """Return the folder of the scene's own run, runs/<scene>, which has the stage `poses` for all variants too."""
-    return home.with_name(home.name.split("@")[0])
 
 
 def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
@@ -241,16 +236,14 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion view`: serve the viewer of one scene until Ctrl-C, and print its address."""
     parser = cli.scene_parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
     access = Access(arguments.port)
-    try:
-        window = Viewer(cli.run_folder(arguments), arguments.port, access)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    window = Viewer(cli.run_folder(arguments), arguments.port, access)
     print(f"{access.link(f'http://127.0.0.1:{window.server.get_port()}/')}  (Ctrl-C ends)", flush=True)
     try:
         window.server.sleep_forever()

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes.capture_checks import run_with_messages
+from scenes.capture_checks import pose_errors, run_with_messages
 from scenes.room import render_room_corner, room_textures, room_walk
 
-from lab.studies.bare_photographs import pose_errors
 from reffusion.capture.load import load_capture
 from reffusion.io.files import BadInput
 

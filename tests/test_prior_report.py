@@ -11,9 +11,9 @@ import pytest
 from lab.prior import images
 from lab.studies import holes
 from lab.studies import prior as benchmark
+from lab.studies import prior_page as page
 from reffusion.io.images import load_image, save_image
 from reffusion.metrics import image_metrics
-from report import prior as page
 
 pytestmark = pytest.mark.integration
 
@@ -87,9 +87,9 @@ def test_a_wrong_reference_has_another_picture_and_the_same_holes(tmp_path):
 
 def test_settings_are_checked_and_come_last():
     assert benchmark.parse_setting("betas=[0.8, 0.99]") == ("betas", [0.8, 0.99])
-    assert benchmark.profile_params("a/prior", {"steps": 7}).steps == 7
+    assert benchmark.profile_params("personalize", "laptop", {"steps": 7}).steps == 7
     with pytest.raises(ValueError, match="steeps"):
-        benchmark.profile_params("a/prior", {"steeps": 7})
+        benchmark.profile_params("personalize", "laptop", {"steeps": 7})
     with pytest.raises(argparse.ArgumentTypeError, match="NAME=VALUE"):
         benchmark.parse_setting("steps")
 

@@ -6,7 +6,6 @@ A work-precision diagram shows the error of a method against its time, for sever
   bilateral           the fast bilateral solver along its iterations, by cell size
   completion          depth completion by a thin plate, by the size of its grid
   alignment           plain and robust alignment of depth, by the share of outliers
-  tile                (--slow) the rasterizer, by height of a tile; each height is compiled anew
 
 The command prints the recommended setting of each diagram. It writes a PNG for each diagram, and precision.json with
 the error and the seconds of every point: CPU seconds with one thread, except for `cutoff` (a count of the work times a
@@ -36,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 RETRIES = 2  # additional measurements of diagrams that fail the gate
 BASELINES = Path(__file__).with_name("baselines.json")
-QUICK = {
+DIAGRAMS = {
     "footprint": splat.footprint_diagram,
     "cutoff": splat.cutoff_diagram,
     "bilateral": solvers.bilateral_diagram,
@@ -48,21 +47,17 @@ QUICK = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--slow", action="store_true", help="also measure tiles")
     parser.add_argument("--gate", action="store_true", help="fail if a point is worse than its baseline")
     parser.add_argument("--write-baselines", action="store_true", help="store the measured values as baselines")
     parser.add_argument("--baselines", type=Path, default=BASELINES)
-    parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile"], help="these diagrams")
+    parser.add_argument("--only", nargs="+", choices=list(DIAGRAMS), default=list(DIAGRAMS), help="these diagrams")
     arguments = parser.parse_args()
-    slow = {"tile": splat.tile_diagram}
-    every = QUICK | slow
-    chosen = arguments.only or [*QUICK, *(slow if arguments.slow else ())]
     baselines = gate.load(arguments.baselines) if arguments.gate else None  # a missing file is reported before any work
     torch.set_num_threads(1)
     arguments.out.mkdir(parents=True, exist_ok=True)
     unit, diagrams = gate.machine_unit(), []
-    for name in chosen:
-        diagram = every[name]()
+    for name in arguments.only:
+        diagram = DIAGRAMS[name]()
         diagrams.append(diagram)
         draw(diagram, arguments.out / f"{name}.png")
         print(recommendation(diagram), flush=True)
@@ -71,17 +66,13 @@ def main() -> int:
     (arguments.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
     print(f"pictures and precision.json in {arguments.out}/; machine unit {1e3 * unit:.1f} ms")
     if arguments.write_baselines:
-        old = (
-            json.loads(arguments.baselines.read_text())["diagrams"]
-            if arguments.only and arguments.baselines.exists()
-            else {}
-        )
+        old = json.loads(arguments.baselines.read_text())["diagrams"] if arguments.baselines.exists() else {}
         measured["diagrams"] = old | measured["diagrams"]
         arguments.baselines.write_text(json.dumps(measured, indent=1) + "\n")
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
     for _ in range(RETRIES if worse else 0):  # on a busy machine, a point is slow only if it is slow repeatedly
         named = {line.split(":")[0] for line in worse}
-        diagrams = [gate.take_faster(d, every[d.name]()) if d.name in named else d for d in diagrams]
+        diagrams = [gate.take_faster(d, DIAGRAMS[d.name]()) if d.name in named else d for d in diagrams]
         worse = gate.regressions(diagrams, unit, baselines)
     for line in worse:
         print(f"regression: {line}", file=sys.stderr)

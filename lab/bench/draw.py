@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lab.bench.points import Diagram
+from report import charts
 
 
 def draw(diagram: Diagram, path: Path) -> None:
@@ -17,19 +18,16 @@ def draw(diagram: Diagram, path: Path) -> None:
         diagram: what to draw.
         path: PNG to write.
     """
-    from matplotlib.figure import Figure
-
     against_time = diagram.over == "seconds"
-    figure = Figure(figsize=(7.2, 4.6) if against_time else (9.6, 4.2), layout="constrained")
-    panels = figure.subplots() if against_time else figure.subplots(1, 2)
+    figure, grid = charts.new_figure(4.6, 1, 1 if against_time else 2)
     long = against_time and min(p.seconds for p in diagram.points) > 10
     scale, work = (1.0, "seconds") if long else (1e3, "milliseconds of CPU")
-    axes = panels if against_time else panels[0]
+    axes = grid[0, 0]
     for curve, points in diagram.curves.items():
         across = [scale * p.seconds if against_time else p.x for p in points]
         axes.plot(across, [p.error for p in points], marker=".", label=curve)
         if not against_time:
-            panels[1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
+            grid[0, 1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
         for x, point in zip(across, points, strict=True):
             if against_time and point.stands:
                 axes.annotate(point.setting, (x, point.error), textcoords="offset points", xytext=(4, 4), fontsize=7)
@@ -39,9 +37,7 @@ def draw(diagram: Diagram, path: Path) -> None:
     if against_time or min(p.x for p in diagram.points) > 0:
         axes.set_xscale("log")
     if not against_time:
-        panels[1].set(xlabel=diagram.over, ylabel="milliseconds of CPU", xscale=axes.get_xscale(), yscale="log")
-        panels[1].grid(alpha=0.3, which="both")
-    axes.grid(alpha=0.3, which="both")
+        grid[0, 1].set(xlabel=diagram.over, ylabel="milliseconds of CPU", xscale=axes.get_xscale(), yscale="log")
     axes.legend(fontsize=8)
     figure.suptitle(diagram.title, fontsize=10)
-    figure.savefig(path, dpi=110)
+    charts.save_chart(figure, path)

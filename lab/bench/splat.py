@@ -1,16 +1,9 @@
 """Diagrams of the rasterizer in float32 against the oracle, the plain torch implementation in float64.
 
-They vary the size of footprints, the cut-off of faint contributions, and the height of tiles.
+They vary the size of footprints and the cut-off of faint contributions.
 """
 
 from __future__ import annotations
-
-import json
-import os
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,11 +12,9 @@ from lab.bench.points import Diagram, Point, cpu_seconds
 from reffusion.splat import pure_torch, rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-ROOT = Path(__file__).resolve().parents[2]
 VIEW = Camera("bench", 96, 72, 100.0, 100.0, 48.0, 36.0, np.eye(4))
 FOOTPRINTS = (0.3, 1.0, 3.0, 10.0, 30.0)  # standard deviation, px
 CUTOFFS = (1 / 2048, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64, 1 / 32)  # alpha below which contributions are skipped
-TILES = (16, 32, 64, 128)  # heights of tiles, px
 LAYERS = 20  # approximate number of opaque layers over a pixel
 
 
@@ -135,51 +126,3 @@ def cutoff_diagram() -> Diagram:
         points,
         why="Kept at 1/255, under half a level of 8 bits, as in 3DGS, with which scenes are exchanged.",
     )
-
-
-def tile_diagram() -> Diagram:
-    """Measure the rasterizer by the height of tiles: the error of the worst gradient, and the CPU time of a `step`.
-
-    Each height is compiled in a process of its own, which takes about a minute.
-    """
-    points = []
-    for height in TILES:
-        with tempfile.TemporaryDirectory() as cache:
-            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-            command = [sys.executable, "-m", "lab.bench.splat", str(height), cache]
-            answer = subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True)
-        for curve, (error, seconds) in json.loads(answer.stdout.splitlines()[-1]).items():
-            points.append(Point(curve, f"{height} px", height, error, seconds))
-    return Diagram(
-        "tile",
-        "Rasterizer float32, height of a tile",
-        "relative L2 error of the worst gradient",
-        ("footprints of 3 px", "64 px"),
-        points,
-        tolerance=1.5,
-    )
-
-
-def measured() -> dict[str, tuple[float, float]]:
-    """Measure the rasterizer with the present tile height, for three sizes of footprints.
-
-    Returns:
-        Name of a curve -> (relative L2 error of the worst gradient, CPU seconds of a `step`).
-    """
-    torch.set_num_threads(1)
-    diagrams = {}
-    for sigma in (1.0, 3.0, 10.0):
-        single = scene(sigma).map(torch.Tensor.float)
-        seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=9)
-        diagrams[f"footprints of {sigma:g} px"] = (errors(scene(sigma))[1], seconds)
-    return diagrams
-
-
-if __name__ == "__main__":
-    from reffusion.kernels import compiled
-    from reffusion.splat import layout
-
-    layout.TILE_HEIGHT = int(sys.argv[1])  # set before the kernels are imported, because they compile it as a constant
-    # The usual cache folder depends on the sources only, and would give kernels of another height.
-    compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"
-    print(json.dumps(measured()))

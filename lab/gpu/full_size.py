@@ -1,37 +1,26 @@
-"""One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
+"""Inputs and steps of the GPU benchmark, and the memory of full-size priors: `python -m lab.gpu.full_size`.
 
-The configurations are the published ones (`random_priors`); the steps are those of the library. The script also
-compares the noise (epsilon) that the trained model predicts with that of a fresh model of the same weights, into which
-the saved LoRA is merged. It reports the largest difference, which should be rounding only.
-
-    python -m lab.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
+The program counts the gigabytes of SD2-inpainting's weights and of one sample of each step, in half precision. The
+configurations are the published ones (`random_priors`); the steps are those of the library.
 """
 
 from __future__ import annotations
 
-import argparse
-import gc
 import json
-import resource
-import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from lab.gpu.random_priors import SD2, Shape, assemble_prior, build_prior, count_parameters, networks, shrink
+from lab.gpu.random_priors import SD2, Shape, assemble_prior, networks
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
-from reffusion.params.base import Prompts
 from reffusion.params.distill import SdsTerm
 from reffusion.params.personalize import Optimizer, Params
-from reffusion.prior import crops, denoising, diffusion, lora, memory
-from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing
-from reffusion.prior.personalize import WEIGHT_DECAY, train_step
+from reffusion.prior import crops, denoising, lora, memory
+from reffusion.prior.model import Prior, enable_checkpointing
+from reffusion.prior.personalize import WEIGHT_DECAY
 from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
-from reffusion.weights import published
 
 
 def reference(size: int) -> crops.Picture:
@@ -83,31 +72,6 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     return {name: round(count / 1e9, 6) for name, count in sizes.items()}
 
 
-def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
-    """Attach a LoRA to the prior in place, make one personalization step, and save the LoRA to `folder`.
-
-    Returns:
-        "loss" of the step, and "lora_unet" and "lora_text", the sums of absolute values of the LoRA's weights after it.
-    """
-    trained, optimizer, training = trainer(prior, batch)
-    loss = train_step(prior, optimizer, [picture], training, 0)
-    lora.set_dropout(prior, False)
-    lora.save(prior, folder)
-    moved = {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
-    return {"loss": loss} | moved
-
-
-@torch.no_grad()
-def epsilon(prior: Prior) -> torch.Tensor:
-    """Return the noise that the prior predicts for a fixed input, to be compared before and after saving the LoRA."""
-    side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
-    channels = prior.vae.config.latent_channels
-    noisy, blanked = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
-    condition = torch.cat([torch.ones_like(noisy[:, :1]), blanked], 1)
-    at = torch.tensor([500], device=prior.device)
-    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [Prompts().whole])).cpu()
-
-
 def train_view(size: int, device: str) -> TrainView:
     """Make a training view of `size` px height, a quarter wider than high, whose middle is to be repainted."""
     width = size + size // 4
@@ -157,105 +121,5 @@ def sds_step(
     return {"gradient_norm": norm}
 
 
-# ---------------------------------------------------------------------------------------------------------------- main
-
-
-def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
-    """Call `work`, record and print its time and the process's peak memory so far, and return its result.
-
-    Args:
-        report: receives under `name` "seconds" (wall time), "cpu_seconds" and "peak_gb", and the entries of the result
-            if it is a dictionary.
-        name: name of the measured work.
-        work: function to call.
-    """
-    began, cpu = time.perf_counter(), time.process_time()
-    result = work()
-    line = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
-    line["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    report[name] = {key: round(value, 3) for key, value in line.items()}
-    report[name] |= result if isinstance(result, dict) else {}
-    print(f"{name:<24} {json.dumps(report[name])}", flush=True)
-    return result
-
-
-def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
-    """Run one personalization step and one SDS step on the CPU, test the saved LoRA, and return the measurements.
-
-    Args:
-        shape: configuration of the prior.
-        dtype: dtype of UNet and text encoders.
-        options: the parsed command line.
-
-    Returns:
-        "parameters", "dtype", "size" (px), the measurements of `record_time`, and "epsilon difference": the largest
-        absolute difference of the noise predicted with the saved LoRA from that of the trained model; "epsilon size":
-        the largest absolute value of the latter.
-    """
-    options.out.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {
-        "parameters": count_parameters(shape),
-        "dtype": str(dtype),
-        "size": shape.unet["sample_size"] * 8,
-    }
-
-    def made() -> Prior:
-        prior = build_prior(shape, dtype)
-        return enable_checkpointing(prior) if options.checkpointing else prior
-
-    prior = record_time(report, "build", made)
-    report["size"] = size = prior.native_size
-    picture = reference(size)
-    record_time(
-        report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out)
-    )
-    before = record_time(report, "epsilon of the trained", lambda: epsilon(prior))
-    del prior
-    gc.collect()
-    prior = lora.merge(record_time(report, "build again", made), options.out)
-    after = record_time(report, "epsilon of the loaded", lambda: epsilon(prior))
-    report["epsilon difference"] = float((after - before).abs().max())
-    report["epsilon size"] = float(before.abs().max())
-    with torch.no_grad():
-        text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, Prompts().texts))
-    prior = drop_text_encoders(prior)
-    gc.collect()
-    sds, scene = SdsTerm(patches=options.patches), gaussians(options.gaussians, "cpu")
-    record_time(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
-    return report
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dtype", choices=["float32", "bfloat16"], default="bfloat16")
-    parser.add_argument("--size", type=int, default=0, help="native side in px; 0: the published one")
-    parser.add_argument("--batch", type=int, default=1, help="samples of the personalization step")
-    parser.add_argument("--patches", type=int, default=2, help="local patches of the SDS step")
-    parser.add_argument("--gaussians", type=int, default=2000)
-    parser.add_argument("--memory-gb", type=float, default=20.0, help="refuse to start if the weights need more")
-    parser.add_argument("--checkpointing", action="store_true")
-    parser.add_argument("--toy", action="store_true", help="few channels, 32 px")
-    parser.add_argument("--count", action="store_true", help="only count the memory of one sample")
-    parser.add_argument("--out", type=Path, default=Path("runs/full-size"))
-    options = parser.parse_args()
-    shape = shrink(SD2) if options.toy else SD2
-    if options.size:
-        factor = 2 ** (len(shape.vae["block_out_channels"]) - 1)
-        shape = Shape(shape.unet | {"sample_size": options.size // factor}, shape.vae, shape.texts)
-    if options.count:
-        print(json.dumps(peak_memory(shape, getattr(torch, options.dtype)), indent=1))
-        return
-    need = 1.2 * count_parameters(shape) * (4 if options.dtype == "float32" else 2) / 1e9
-    if need > options.memory_gb:
-        parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")
-    with memory.explain_oom("--size", options.size):
-        report = run(shape, getattr(torch, options.dtype), options)
-    (options.out / "full_size.json").write_text(json.dumps(report, indent=1) + "\n")
-    if not options.toy and report["parameters"] != published.PUBLISHED[published.SD2].parameters:
-        raise SystemExit(
-            f"error: reffusion/weights/published.py states another number of parameters: {report['parameters']}"
-        )
-
-
 if __name__ == "__main__":
-    main()
+    print(json.dumps(peak_memory(SD2, torch.bfloat16), indent=1))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from reffusion.prior.levels import measure_levels
 from reffusion.prior.model import CONDITIONING
 from reffusion.seeding import generator, seed_for
 from reffusion.trace import load_checkpoint, save_checkpoint
+from report import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -290,7 +290,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    cli.command(main)()

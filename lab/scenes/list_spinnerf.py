@@ -18,6 +18,7 @@ from reffusion.capture.load import load_capture
 from reffusion.capture.roles import assign_roles
 from reffusion.io.files import BadInput, is_file
 from reffusion.io.images import image_size
+from report import cli
 
 SCENES = ("1", "2", "3", "4", "7", "9", "10", "12", "book", "trash")
 TRAIN, TEST = 60, 40
@@ -85,13 +86,11 @@ def _size(folder: Path) -> str:
     return f"{folder.name} {width}x{height}"
 
 
+@cli.command
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
-    try:
-        print("\n".join(summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print("\n".join(summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 
+from lab.studies import jobs
 from lab.studies.scene_priors import run_study
 from reffusion import trace
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
@@ -25,15 +25,11 @@ from reffusion.distill.loop import average, build_objective, masked_factors, tak
 from reffusion.distill.terms.term import TermInputs
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
-from reffusion.io.ground_truth import load_ground_truth, load_object_mask
-from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
 from reffusion.workspace import Workspace
 from report import charts
-
-ROOT = Path(__file__).resolve().parents[2]
 
 MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps after which scores are measured
 VIEWS = 10  # test views, evenly spread
@@ -41,56 +37,36 @@ SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
 BASE = "personalize"  # key of an attempt, not a parameter of `distill`: False uses the prior before personalization
 # 3DGS's full step sizes for masked Gaussians, i.e. for those that the initialization added.
-FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}
+FREE = {"lr.epsilon": 1e-15, "lr.masked": 1.0, "lr.opacities": 1.0}
 # Name of a setting -> its differences from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
-    "no SDS": {"sds": {"weight": 0}},
+    "no SDS": {"sds.weight": 0},
     "prior not personalized": {BASE: False},
-    "a tenth of the weight": {"sds": {"weight": 0.03}},
-    "ten times the weight": {"sds": {"weight": 3}},
-    "every view": {"sds": {"max_angle": 180}},
-    "contrast not kept": {"sds": {"keep_contrast": False}},
-    "two windows as well": {"sds": {"patches": 2}},
-    "two windows, a tenth of the weight": {"sds": {"patches": 2, "weight": 0.03}},
-    "timesteps under 0.3": {"sds": {"t_high": 0.3}},
-    "all timesteps": {"sds": {"t_high": 0.98}},
+    "a tenth of the weight": {"sds.weight": 0.03},
+    "ten times the weight": {"sds.weight": 3},
+    "every view": {"sds.max_angle": 180},
+    "contrast not kept": {"sds.keep_contrast": False},
+    "two windows as well": {"sds.patches": 2},
+    "two windows, a tenth of the weight": {"sds.patches": 2, "sds.weight": 0.03},
+    "timesteps under 0.3": {"sds.t_high": 0.3},
+    "all timesteps": {"sds.t_high": 0.98},
     "free steps": FREE,
-    "free steps, all timesteps": FREE | {"sds": {"t_high": 0.98}},
-    "free steps, all timesteps, not personalized": FREE | {"sds": {"t_high": 0.98}, BASE: False},
-    "free steps, no SDS": FREE | {"sds": {"weight": 0}},
+    "free steps, all timesteps": FREE | {"sds.t_high": 0.98},
+    "free steps, all timesteps, not personalized": FREE | {"sds.t_high": 0.98, BASE: False},
+    "free steps, no SDS": FREE | {"sds.weight": 0},
 }
 
 
-def profile_params(overrides: dict) -> Params:
-    """Return the laptop profile's parameters of `distill` with SDS, changed by the overrides of an attempt.
-
-    An override that is a dictionary changes only the entries that it names. The key `BASE` is no parameter and ignored.
-    """
-    values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
-    values["sds"]["run"] = "always"
-    for name, value in overrides.items():
-        if name != BASE:
-            values[name] = values.get(name, {}) | value if isinstance(value, dict) else value
-    return Params(**values)
+def attempt_params(overrides: dict) -> Params:
+    """Return the laptop profile's parameters of `distill` with SDS, changed by the overrides of an attempt."""
+    changes = {name: value for name, value in overrides.items() if name != BASE}
+    return jobs.profile_params("distill", "laptop", {"sds.run": "always", **changes})
 
 
 def load_test_views(run: Path) -> list[tuple]:
-    """Load `VIEWS` evenly spread test views of a run as (camera, truth uint8 [H, W, 3], box of the mask).
-
-    Raises:
-        ValueError: no test view has ground truth and a mask.
-    """
-    scene, views = load_scene(run / "poses"), []
-    for name in scene.test:
-        camera = scene.cameras[name]
-        truth = load_ground_truth(camera, run / "poses")
-        box = image_metrics.mask_box(load_object_mask(camera, run / "raw_masks", run / "masks"))
-        if truth is not None and box is not None:
-            views.append((camera, truth, box))
-    if not views:
-        raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    return [views[place] for place in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)]
+    """Load `VIEWS` test views of a run as (camera, truth uint8 [H, W, 3], box of the mask); errors as of `jobs`."""
+    return [(camera, truth, image_metrics.mask_box(mask)) for camera, truth, mask in jobs.load_test_views(run, VIEWS)]
 
 
 @torch.no_grad()
@@ -116,7 +92,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
         {"seconds", "iteration", scores...} after each of `MEASURED_STEPS`. The seconds are the wall time since the
         first step began, without the measurements.
     """
-    params = profile_params(overrides)
+    params = attempt_params(overrides)
     space = Workspace(run / "poses", run / "fit", run / "masks")
     initial, masked, holes = load_initialization(params, space.scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None

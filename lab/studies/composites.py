@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 from lab.studies import compositing, drawn_places, placement, scoring
+from lab.studies.jobs import run_job
 from lab.studies.placement import Place
 from reffusion.io.images import save_image
 from report.job import draw_job
 from report.job_data import load_job
-
-ROOT = Path(__file__).resolve().parents[2]
 
 # Places on which settings are chosen.
 TUNING_PLACES = (
@@ -93,19 +91,6 @@ def make_scenes(place: Place, captures: Path, options: compositing.Options, out:
     return scene, untouched
 
 
-def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
-    """Run all stages of a scene that are not finished yet, and return the folder of the run.
-
-    Raises:
-        ValueError: a stage failed.
-    """
-    command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
-    command += ["--variant", variant] if variant else []
-    if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
-        raise ValueError(f"{scene.name}: the job failed; see above")
-    return runs / (f"{scene.name}@{variant}" if variant else scene.name)
-
-
 def evaluate_place(
     place: Place, captures: Path, options: compositing.Options, out: Path, profile: str, variants: list[str]
 ) -> dict:
@@ -123,8 +108,11 @@ def evaluate_place(
         Row of the table: the result of `scoring.score_place`, and "place", the name of the scene.
     """
     scene, untouched = make_scenes(place, captures, options, out)
-    run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
-    others = {name: scoring.Run.load_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
+    run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile=profile)) for folder in (scene, untouched))
+    others = {
+        name: scoring.Run.load_variant(run, run_job(scene, out / "runs", profile=profile, variant=name))
+        for name in variants
+    }
     save_image(out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     for name, other in others.items():
         save_image(out / f"{scene.name}@{name}.png", scoring.comparison_sheet(other, ceiling))

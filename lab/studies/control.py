@@ -16,8 +16,6 @@ reference's pixels in other views. Scenes are those of the kind `mono`, which ho
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +27,7 @@ from torch import Tensor
 
 from lab.studies import scene_priors
 from lab.studies.exact_prior import make_fillings, make_prior
+from lab.studies.jobs import ROOT, run_job
 from lab.studies.prior import keep_if_same
 from reffusion import geometry
 from reffusion.distill import depth_estimator
@@ -55,7 +54,6 @@ from report.paired_statistics import confidence_half_width
 from report.sheet import compose_sheet
 from runner.resolve import Request, resolve
 
-ROOT = Path(__file__).resolve().parents[2]
 # Method -> variant of pipeline.yaml. "start" is the initialization. The next two have the true views in place of SDS.
 METHODS = {
     "start": "",
@@ -86,13 +84,11 @@ def run_stages(scene: Path, runs: Path, method: str, more: str, stages: Sequence
     Raises:
         ValueError: a stage failed.
     """
-    variant = METHODS[method]
+    profile, variant = "paper-terms", METHODS[method]
     for stage in stages:
-        command = ["run", stage, "--scene", scene, "--runs", runs, "--profile", "paper-terms", "--variant", variant]
-        if subprocess.run([sys.executable, "-m", "runner", *map(str, command), "--set", more], cwd=ROOT).returncode:
-            raise ValueError(f"{scene.name}, {method}: a stage failed; see above")
-    request = Request(ROOT, runs, str(scene), profile="paper-terms", variant=variant or None, set=more)
-    return runs / (f"{scene.name}@{variant}" if variant else scene.name), Params(**resolve(request).params["distill"])
+        run = run_job(scene, runs, stage, profile, variant, more)
+    request = Request(ROOT, runs, str(scene), profile=profile, variant=variant or None, set=more)
+    return run, Params(**resolve(request).params["distill"])
 
 
 def load_truth(scene: Path, views: Sequence[TrainView]) -> list[Tensor]:

@@ -29,8 +29,7 @@ from reffusion.io.images import load_image
 from reffusion.io.scene import load_scene
 from reffusion.prior import diffusion, lora
 from reffusion.prior.model import Prior, load_prior
-
-ROOT = Path(__file__).resolve().parents[2]
+from report import charts
 
 TIMESTEPS = (20, 100, 300, 600, 850)
 NOISES = 4  # draws of the noise; two estimates of g use half of the draws each, so that their noise is independent
@@ -174,10 +173,8 @@ def draw(rows: list[dict], path: Path) -> None:
         rows: result of `measure` for priors named "unadapted" and "personalized"; others are not drawn.
         path: PNG to write.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure((9, 3.8), layout="constrained")
-    for axes, scale in zip(figure.subplots(1, 2, sharey=True), SCALES, strict=True):
+    figure, grid = charts.new_figure(3.8, 1, 2, sharey=True)
+    for axes, scale in zip(grid[0], SCALES, strict=True):
         for model, style in (("unadapted", ("tab:grey", "--")), ("personalized", ("tab:blue", "-"))):
             best: dict[str, dict] = {}
             for row in rows:
@@ -194,10 +191,9 @@ def draw(rows: list[dict], path: Path) -> None:
                     )
         axes.set(title=f"{scale} views" if scale == "whole" else "windows", xlabel="PSNR in the hole before (dB)")
         axes.set_yscale("symlog", linthresh=0.01)
-        axes.grid(alpha=0.3)
-    figure.axes[0].set(ylabel="greatest gain of one exact step (dB)")
-    figure.axes[1].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    grid[0, 0].set(ylabel="greatest gain of one exact step (dB)")
+    grid[0, 1].legend(fontsize=8)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:

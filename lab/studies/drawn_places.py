@@ -24,6 +24,7 @@ from lab.studies import compositing, placement
 from lab.studies.placement import Place
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import save_image
+from report.sheet import compose_sheet
 
 LIST = Path(__file__).with_name("drawn_places.json")
 # seed -> captures in the order in which they are drawn, number of places of each, and number of the first place
@@ -82,7 +83,7 @@ def _draw_place(random: np.random.Generator, capture: placement.Photographs, nam
 
 
 def draw_sheet(capture: placement.Photographs, places: Sequence[Place]) -> np.ndarray:
-    """Return a picture, uint8 [H, W, 3], with a row for each place, two rows side by side."""
+    """Return a picture, uint8 [H, W, 3], with a row for each place."""
     rays, height = compositing.PixelRays(capture), round(SHEET_WIDTH * capture.height / capture.width)
     rows = []
     for place in places:
@@ -93,10 +94,8 @@ def draw_sheet(capture: placement.Photographs, places: Sequence[Place]) -> np.nd
             photo = compositing.load_photograph(capture, name) / 255
             picture, _ = compositing.composite_object(photo, rays, capture.cameras[name], thing, TINTS)
             pictures.append(cv2.resize(picture, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA))
-        row = np.concatenate(pictures, 1)
-        rows.append(cv2.putText(row, place.name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1))
-    rows += [np.zeros_like(rows[0])] * (len(rows) % 2)
-    return np.concatenate([np.concatenate(rows[k : k + 2], 1) for k in range(0, len(rows), 2)])
+        rows.append(pictures)
+    return compose_sheet(rows, ["its view", "first view", "last view"], [place.name for place in places])
 
 
 def main() -> None:

@@ -15,17 +15,18 @@ import json
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from lab.studies.jobs import profile_params
 from reffusion import trace
 from reffusion.fit.exposure import load_photos_in_scene_exposure
+from reffusion.io.arrays import save_text
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene, load_views
 from reffusion.metrics import image_metrics, lpips
 from reffusion.splat.rasterizer import render
+from report import charts, page
 from stages import fit
 
-ROOT = Path(__file__).parents[2]
 BLOCK, BLOCK_DB = 32, 18.0  # side of a block of a training view in px, and the PSNR below which people see it
 VARIANTS = {  # name -> differences from the profile's parameters of `fit`
     "laptop": {},
@@ -44,21 +45,6 @@ VARIANTS = {  # name -> differences from the profile's parameters of `fit`
         "lr.shN": 1.25e-4,
     },
 }
-
-
-def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
-    """Return a profile's parameters of `fit` with overrides.
-
-    Args:
-        profile: name of the profile.
-        overrides: dotted name of a parameter -> value.
-        every: every n-th training view is held out.
-
-    Raises:
-        ValueError: a parameter is unknown; the message names it.
-    """
-    params = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
-    return fit.Params(**params).changed({**overrides, "holdout": every})
 
 
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
@@ -127,17 +113,14 @@ def draw(curves: dict[str, list[dict[str, float]]], title: str, path: Path) -> N
         title: title of the chart.
         path: PNG to write.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
+    figure, grid = charts.new_figure(4.2, 1, 1)
+    axes = grid[0, 0]
     for name, lines in curves.items():
         late = [line for line in lines if line["seconds"] >= 1]
         axes.plot([p["seconds"] for p in late], [p["psnr_held_out"] for p in late], marker=".", label=name)
     axes.set(xscale="log", xlabel="seconds of fitting", ylabel="PSNR of held-out views (dB)", title=title)
-    axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:
@@ -152,7 +135,8 @@ def main() -> None:
     if not (poses / "receipt.json").exists():
         raise ValueError(f"{poses} is missing: run `make scene={arguments.run.name} poses` first")
     chosen = {
-        name: fit_params(arguments.profile, VARIANTS[name], arguments.every) for name in arguments.only or VARIANTS
+        name: profile_params("fit", arguments.profile, VARIANTS[name] | {"holdout": arguments.every})
+        for name in arguments.only or VARIANTS
     }
     curves, perceptual, training = {}, {}, {}
     for name, params in chosen.items():
@@ -167,16 +151,14 @@ def main() -> None:
     columns = ("seconds", "iteration", "gaussians", "psnr", "psnr_held_out")
     rows = [",".join([name.replace(",", ";"), *(str(p[c]) for c in columns)]) for name in curves for p in curves[name]]
     (out / "fit.csv").write_text("\n".join([",".join(["variant", *columns]), *rows]) + "\n")
-    ends = [(name, lines[-1]) for name, lines in curves.items()]
-    cells = [
-        f"| {n} | {p['seconds']:.0f} | {p['gaussians']} | {perceptual[n]:.4f} | {p['psnr_held_out']:.2f} "
-        f"| {training[n][0]:.2f} | {training[n][1]:.4f} |"
-        for n, p in ends
-    ]
-    columns = ("variant", "seconds", "Gaussians", "held-out LPIPS (vgg)", "held-out PSNR (dB)")
-    columns += ("worst training view (dB)", f"blocks under {BLOCK_DB:.0f} dB")
-    head = f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}\n"
-    (out / "fit.md").write_text(head + "\n".join(cells) + "\n")
+    header = ["variant", "seconds", "Gaussians", "held-out LPIPS (vgg)", "held-out PSNR (dB)"]
+    header += ["worst training view (dB)", f"blocks under {BLOCK_DB:.0f} dB"]
+    cells = []
+    for name, lines in curves.items():
+        end, (worst, share) = lines[-1], training[name]
+        cells.append([name, f"{end['seconds']:.0f}", str(end["gaussians"]), f"{perceptual[name]:.4f}"])
+        cells[-1] += [f"{end['psnr_held_out']:.2f}", f"{worst:.2f}", f"{share:.4f}"]
+    save_text(out / "fit.md", page.markdown_table(header, cells))
     draw(curves, f"{arguments.run.name}, every {arguments.every}th view held out", out / "fit.png")
 
 

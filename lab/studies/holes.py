@@ -22,8 +22,6 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.prior import diffusion, harmonic_fill
 from reffusion.prior.model import Prior
 
-ROOT = Path(__file__).resolve().parents[2]
-
 SIDE = 64  # side of the held-out pictures, px
 SEED = 20  # seed of the held-out set; training and validation of the prior use other seeds
 COVER = (0.05, 0.4)  # share of a held-out picture that its hole covers
@@ -116,7 +114,7 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
     return {
         "psnr": min(-10 * np.log10(error), image_metrics.PSNR_CAP) if error > 0 else image_metrics.PSNR_CAP,
         "ssim": float(ssim_map(picture, truth)[hole].mean()),
-        "flip": float(flip_map(picture, truth)[hole].mean()),
+        "flip": float(image_metrics.flip_map(picture, truth)[hole].mean()),
         "energy": gradient_energy(picture, hole) / max(gradient_energy(truth, hole), 1e-9),
         "lpips": _lpips(picture, truth),
     }
@@ -151,11 +149,6 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
         full=True,
     )
     return values.mean(2)
-
-
-def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the map [H, W] of LDR-FLIP, with the viewing distance of `image_metrics.flip`."""
-    return image_metrics.flip_map(picture, truth)
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lab.studies import composites, compositing, placement, scoring
+from lab.studies.jobs import ROOT, run_job
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
@@ -125,11 +126,11 @@ def write_scenes(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", type=Path, default=composites.ROOT.parent / "shared/data")
+    parser.add_argument("--captures", type=Path, default=ROOT.parent / "shared/data")
     parser.add_argument("--start", default="bear-rim")
     parser.add_argument("--goal", default="bear-rock")
     parser.add_argument("--profile", default="laptop")
-    parser.add_argument("--out", type=Path, default=composites.ROOT / "runs/moving")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs/moving")
     arguments = parser.parse_args()
     (start,), (goal,) = (composites.select_places(name, False) for name in (arguments.start, arguments.goal))
     if start.capture != goal.capture:
@@ -140,9 +141,8 @@ def main() -> None:
         start, goal, placement.load_photographs(arguments.captures / start.capture), arguments.out / "scenes"
     )
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (
-        scoring.Run.load(composites.run_job(each, arguments.out / "runs", arguments.profile)) for each in folders
-    )
+    jobs = [run_job(each, arguments.out / "runs", profile=arguments.profile) for each in folders]
+    run, ceiling = (scoring.Run.load(job) for job in jobs)
     save_image(arguments.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     scores = scoring.score_place(run, ceiling, {})
     save_json(arguments.out / "moving.json", {"place": scene.name, **scores})

@@ -18,7 +18,7 @@ Measurements and options:
   --wrong-reference   repeat with a wrong reference, which must not help: a picture in place of the reference, or
                 another scene's run, whose personalized prior is used as it is
 
-The study writes prior.json and rows of pictures to --out; `python -m report.prior` makes a page of them
+The study writes prior.json and rows of pictures to --out; `python -m lab.studies.prior_page` makes a page of them
 (`make prior-report` does both). Every draw is seeded. LPIPS needs the network's weights (`make weights`).
 """
 
@@ -48,10 +48,10 @@ from lab.studies.holes import (
     save_row,
     to_tensors,
 )
+from lab.studies.jobs import load_test_views, profile_params
 from lab.studies.scene_priors import run_study
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
-from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_references, load_scene
 from reffusion.params.base import Prompts, Settings
@@ -60,8 +60,6 @@ from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
 from report.paired_statistics import confidence_half_width
 from stages import personalize as stage
-
-ROOT = Path(__file__).resolve().parents[2]
 
 TELEA_RADIUS = 5  # radius of both OpenCV methods, px
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
@@ -169,18 +167,11 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
     Raises:
         ValueError: no test view has ground truth and a mask.
     """
-    scene = load_scene(run / "poses")
-    cases = {}
-    for name in scene.test:
-        truth = load_ground_truth(scene.cameras[name], run / "poses")
-        hole = load_object_mask(scene.cameras[name], run / "raw_masks", run / "masks")
-        if truth is not None and hole.any():
-            cases[name] = Case(truth if pictures is None else pictures[name], hole, name)
-    if not cases:
-        raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    places = np.linspace(0, len(cases) - 1, min(VIEWS, len(cases))).round().astype(int)
-    chosen = [list(cases.values())[place] for place in places]
-    reference = load_references(run / "reference", scene)[0]
+    chosen = [
+        Case(truth if pictures is None else pictures[camera.name], hole, camera.name)
+        for camera, truth, hole in load_test_views(run, VIEWS)
+    ]
+    reference = load_references(run / "reference", load_scene(run / "poses"))[0]
     own = _reduced(Case(reference.image, reference.mask, reference.camera.name), size)
     whole, windows = [_reduced(case, size) for case in chosen], []
     for case in chosen:
@@ -201,23 +192,6 @@ def _reduced(case: Case, size: int) -> Case:
     return Case(
         small, cv2.resize(case.hole.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 1e-4, case.kind
     )
-
-
-def profile_params(prior: str, settings: dict) -> stage.Params:
-    """Return the laptop profile's parameters of `personalize` for a prior.
-
-    Args:
-        prior: diffusers folder.
-        settings: dotted name of a parameter -> value that overrides the profile's.
-    """
-    values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    for name, value in {"prior": prior, **settings}.items():
-        *groups, last = name.split(".")
-        place = values
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
-    return stage.Params(**values)
 
 
 @torch.no_grad()
@@ -459,7 +433,7 @@ def main() -> None:
                 shown = {column: round(kinds[kind][column], 3) for column in COLUMNS}
                 print(name, kind, shown, "LPIPS over Telea's:", kinds[kind]["lpips_over_telea"], flush=True)
     if arguments.run:
-        params = profile_params(first, dict(arguments.set))
+        params = profile_params("personalize", "laptop", {"prior": first, **dict(arguments.set)})
         result["personalization"] = measure_personalization(
             params,
             arguments.run,

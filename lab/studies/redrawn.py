@@ -26,6 +26,7 @@ from PIL import Image
 from reffusion.capture.load import load_capture
 from reffusion.io.images import load_image
 from reffusion.references import registration
+from report import page
 
 LONGER_SIDE = 640  # px to which photographs are reduced
 NEAREST = 2  # number of neighboring views whose photographs are given as wrong references of each view
@@ -192,21 +193,18 @@ class Rates:
     accepted_by_place: int = 0
     accepted: int = 0
 
-    def row(self, name: str) -> str:
-        """Return the row of a capture in the Markdown table whose head is `HEADER`."""
+    def row(self, name: str) -> list[str]:
+        """Return the row of a capture in the table whose head is `HEADER`."""
         own, other, foreign = (np.array(each) for each in (self.own, self.other, self.foreign))
         quantiles = lambda values, at: " / ".join(f"{100 * q:.1f}" for q in np.quantile(values, at))
-        return (
-            f"| {name} | {len(own)} | {quantiles(own, (0, 0.01, 0.5))} | {self.refused} | {len(other)} | "
-            f"{quantiles(other, (0.5, 0.99, 1))} | {self.accepted_by_place} | {self.accepted} | "
-            f"{len(foreign)} | {100 * foreign.max():.1f} |"
-        )
+        right = [str(len(own)), quantiles(own, (0, 0.01, 0.5)), str(self.refused)]
+        wrong = [str(len(other)), quantiles(other, (0.5, 0.99, 1)), str(self.accepted_by_place), str(self.accepted)]
+        return [name, *right, *wrong, str(len(foreign)), f"{100 * foreign.max():.1f}"]
 
 
-HEADER = (
-    "| capture | own | in place, %: least / 1 % / median | refused | neighbours | in place, %: median / 99 % / most | "
-    "accepted by place | accepted | other scenes | in place, %: most |\n|" + "---|" * 10
-)
+HEADER = ("capture", "own", "in place, %: least / 1 % / median", "refused")
+HEADER += ("neighbours", "in place, %: median / 99 % / most", "accepted by place", "accepted")
+HEADER += ("other scenes", "in place, %: most")
 
 
 def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
@@ -283,12 +281,12 @@ def main() -> int:
     if arguments.seconds:
         print(measure_seconds(next(iter(first.values()))))
         return 0
-    print(HEADER)
-    names = list(captures)
+    names, rows = list(captures), []
     for name, capture in captures.items():
         foreign = first[names[names.index(name) - 1]]
         chosen = ", chosen on" if name in CHOSEN_ON else ""
-        print(measure(capture, foreign, arguments.every).row(name + chosen), flush=True)
+        rows.append(measure(capture, foreign, arguments.every).row(name + chosen))
+    print(page.markdown_table(HEADER, rows))
     return 0
 
 

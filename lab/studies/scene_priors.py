@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import resource
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import torch
 from reffusion.io.arrays import load_json, save_json
 from reffusion.prior import lora
 from reffusion.prior.model import Prior, load_prior
+from report import cli
 
 DTYPES = ("float32", "float16", "bfloat16")
 
@@ -37,10 +37,7 @@ def study_parser(about: str, needs: str, folder: str) -> argparse.ArgumentParser
 
 def run_study(study: Callable[[], None]) -> None:
     """Run a study as a command; a ValueError ends the command with its message in one line."""
-    try:
-        study()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    cli.command(study)()
 
 
 def load_priors(arguments: argparse.Namespace) -> tuple[dict[str, Prior], str]:

@@ -25,6 +25,8 @@ from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
+from report import page
+from report.sheet import compose_sheet
 
 MIN_ALPHA = 0.9  # a pixel is uncovered if its alpha is lower
 BLACK, LIT = 0.06, 0.15  # a pixel is uncovered too if its brightest channel is below BLACK and the truth's above LIT
@@ -199,7 +201,7 @@ def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
     The columns are the truth, the fit's render with the object, our result, the ceiling, and the absolute difference
     between our result and the truth.
     """
-    rows = []
+    rows = {}
     for name in run.scene.test:
         box, same = (image_metrics.mask_box(of.mask(name), SHEET_MARGIN) for of in (run, ceiling))
         if box is None or same is None:
@@ -207,15 +209,9 @@ def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
         truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))
         difference = cv2.absdiff(truth, ours)
         panels = [truth, box.crop(run.picture(name, "renders_fit")), ours, same.crop(ceiling.picture(name)), difference]
-        rows.append(_row(panels))
-    width = max(row.shape[1] for row in rows)
-    return np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows])
-
-
-def _row(panels: list[np.ndarray]) -> np.ndarray:
-    """Join panels side by side, scaled to a height of `ROW` px, with 4 px of black between them."""
-    scaled = [cv2.resize(p, (round(p.shape[1] * ROW / p.shape[0]), ROW), interpolation=cv2.INTER_AREA) for p in panels]
-    return np.concatenate([np.pad(p, ((0, 0), (0, 4), (0, 0))) for p in scaled], 1)
+        sizes = [(round(panel.shape[1] * ROW / panel.shape[0]), ROW) for panel in panels]
+        rows[name] = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p, size in zip(panels, sizes, strict=True)]
+    return compose_sheet([*rows.values()], ["truth", "with the object", "ours", "ceiling", "difference"], [*rows])
 
 
 def table(rows: list[dict]) -> str:
@@ -230,7 +226,7 @@ def table(rows: list[dict]) -> str:
     variants = list(rows[0]["variants"]) if rows else []
     heads = [*PICTURES, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
     heads += [head for name in variants for head in (name, f"LPIPS, ours / {name}")]
-    lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+    lines = []
     for row in rows:
         cells = [_scores(row[way]) for way in PICTURES]
         cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
@@ -239,8 +235,8 @@ def table(rows: list[dict]) -> str:
         for each in row["variants"].values():
             ours, theirs = row["result"]["lpips_vgg"], each["lpips_vgg"]
             cells += [_scores(each), _number(ours / theirs if ours and theirs else None, 2)]
-        lines.append(f"| {row['place']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([row["place"], *cells])
+    return page.markdown_table(["place", *heads], lines)
 
 
 def _scores(of: dict[str, float | None]) -> str:

@@ -33,8 +33,7 @@ from reffusion.params.base import Prompts
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import Prior
 from reffusion.splat import rasterizer
-
-ROOT = Path(__file__).resolve().parents[2]
+from report import page
 
 VIEWS = 6  # largest number of training views
 NOISES = 8  # draws of the noise per timestep
@@ -133,22 +132,22 @@ def table(results: dict[str, dict[str, dict]]) -> str:
     A table has a row for each timestep, with the pull before and after too, then the rows `over noise`, `over
     timesteps` and `together`.
     """
-    lines = []
+    tables = []
     for scale, by_time in results.items():
         before, after = by_time["before"], by_time["after"]
-        lines += [f"{scale}: squared latents", "", "| | before | after | after / before | pull before | pull after |"]
-        lines.append("|---|---|---|---|---|---|")
+        rows = []
         for k, part in enumerate(TIMESTEPS):
-            pulls = f"{before['pull'][k]:.4f} | {after['pull'][k]:.4f}"
-            lines.append(f"| t = {part:g} | {_pair(before['noise'][k], after['noise'][k])} | {pulls} |")
+            pulls = [f"{each['pull'][k]:.4f}" for each in (before, after)]
+            rows.append([f"t = {part:g}", *_pair(before["noise"][k], after["noise"][k]), *pulls])
         for name in ("over_noise", "over_timesteps", "together"):
-            lines.append(f"| {name.replace('_', ' ')} | {_pair(before[name], after[name])} | | |")
-        lines.append("")
-    return "\n".join(lines)
+            rows.append([name.replace("_", " "), *_pair(before[name], after[name]), "", ""])
+        header = ["", "before", "after", "after / before", "pull before", "pull after"]
+        tables.append(f"{scale}: squared latents\n\n{page.markdown_table(header, rows)}")
+    return "\n".join(tables)
 
 
-def _pair(before: float, after: float) -> str:
-    return f"{before:.4f} | {after:.4f} | {after / max(before, 1e-12):.2f}"
+def _pair(before: float, after: float) -> list[str]:
+    return [f"{before:.4f}", f"{after:.4f}", f"{after / max(before, 1e-12):.2f}"]
 
 
 def main() -> None:

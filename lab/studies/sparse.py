@@ -18,24 +18,22 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from lab.studies.jobs import ROOT, run_job
 from reffusion.io.arrays import load_json, save_json, save_text
 from report import charts
 
-ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 METHOD, PLAIN = "method", "plain 3DGS"
 POINTS = "fit.few_views=fewer_harmonics"  # with this parameter the fit starts from the sparse points
-METHODS = {  # method -> options of the runner
-    METHOD: (),
-    PLAIN: ("--variant=remove_only", f"--set={POINTS}"),
+METHODS = {  # method -> variant, parameters
+    METHOD: ("", ""),
+    PLAIN: ("remove_only", POINTS),
 }
 COLORS = {METHOD: charts.BLUE, PLAIN: charts.ORANGE}
 
@@ -79,12 +77,9 @@ def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
     Raises:
         ValueError: the run failed.
     """
-    home = runs / way.replace(" ", "-")
-    command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
-    if subprocess.run(command, cwd=ROOT).returncode:
-        raise ValueError(f"{scene.name}, {way}: failed; see above")
-    (metrics,) = home.glob(f"{scene.name}*/evaluate/metrics.json")
-    mean = load_json(metrics)["mean"]
+    variant, settings = METHODS[way]
+    run = run_job(scene, runs / way.replace(" ", "-"), variant=variant, settings=settings)
+    mean = load_json(run / "evaluate" / "metrics.json")["mean"]
     return {name: mean[name] for name in SCORES}
 
 

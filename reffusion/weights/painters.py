@@ -23,7 +23,7 @@ def resolve_inpainter(inpainter: Inpainter) -> Inpainter:
     """
     if inpainter.kind != "auto":
         return inpainter
-    can_run = lambda each: not weights_needs(each)[0].problem
+    can_run = lambda each: not inpainter_needs(each)[0].problem
     return next(filter(can_run, [Inpainter(kind=kind) for kind in PAINTERS]), Inpainter(kind="exemplar"))
 
 
@@ -53,27 +53,52 @@ def find_file(inpainter: Inpainter) -> Path:
     return files[0]
 
 
-def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
-    """Return the need for an inpainter's file, as a list of one; an empty list for kinds other than "lama" and "migan".
+def inpainter_needs(inpainter: Inpainter, param: str = "inpainter", dtype: str = "float32") -> list[Need]:
+    """Return what an inpainter needs on this machine: a list of one need, or an empty list.
 
-    The list is empty for the kind "auto" too, which can do without a file. An ONNX file without onnxruntime is also a
-    problem of the need.
+    The list is empty for kinds that need nothing, for "auto", which can do without a file, and for "diffusion", whose
+    model another parameter names.
 
     Args:
         param: name of the parameter that holds the setting, for messages.
+        dtype: the precision in which a pipeline is used.
     """
-    if inpainter.kind not in PAINTERS:
-        return []
+    if inpainter.kind == "pipeline":
+        return [pipeline_need(str(inpainter.weights), dtype)]
+    if inpainter.kind == "command":
+        program = split_command(str(inpainter.command))[0]
+        problem = None if shutil.which(program) else f"{param}: {program} is no program that can be started here"
+        return [Need(program, problem, can_download=False)]
+    if inpainter.kind == "moebius":
+        return [_moebius_need(inpainter, param)]
+    return [_network_need(inpainter, param)] if inpainter.kind in PAINTERS else []
+
+
+def _network_need(inpainter: Inpainter, param: str) -> Need:
+    """Return the need for the file of "lama" or "migan"; an ONNX file without onnxruntime is a problem, too."""
     published = PAINTERS[inpainter.kind]
     try:
         file = find_file(inpainter)
     except ValueError as error:
         if inpainter.weights:
-            return [Need(published.name, f"{param}: {error}", can_download=False)]
-        return [Need(published.repo, f"{param}: {error}", published.bytes, files=(published.file,))]
+            return Need(published.name, f"{param}: {error}", can_download=False)
+        return Need(published.repo, f"{param}: {error}", published.bytes, files=(published.file,))
     lacks_runtime = file.suffix == ".onnx" and importlib.util.find_spec("onnxruntime") is None
     problem = f"{param}: {file.name} needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
-    return [Need(str(file), problem, file.stat().st_size, can_download=False)]
+    return Need(str(file), problem, file.stat().st_size, can_download=False)
+
+
+def _moebius_need(inpainter: Inpainter, param: str) -> Need:
+    """Return the need for the files of Moebius and for onnxruntime."""
+    lacks_runtime = importlib.util.find_spec("onnxruntime") is None
+    problem = f"{param}: Moebius needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
+    try:
+        folder = find_moebius(inpainter)
+    except ValueError as error:
+        can_download = not (inpainter.weights or lacks_runtime)
+        return Need(MOEBIUS.repo, problem or f"{param}: {error}", MOEBIUS.bytes, can_download, files=MOEBIUS.files)
+    size = sum((folder / name).stat().st_size for name in MOEBIUS.files)
+    return Need(str(folder), problem, size, can_download=False)
 
 
 def name_seed_painter(inpainter: Inpainter) -> str:
@@ -96,69 +121,37 @@ def find_moebius(inpainter: Inpainter) -> Path:
     return folder
 
 
-def reference_needs(inpainter: Inpainter, dtype: str, param: str = "reference.inpainter") -> list[Need]:
-    """Return what an inpainter of any kind but "diffusion" needs: a list of one need, or an empty list.
+def inpainter_facts(inpainter: Inpainter) -> dict[str, str]:
+    """Return the facts about an inpainter on which results depend: its kind and a hash of its files.
 
-    Args:
-        dtype: the precision in which a pipeline is used.
-        param: name of the parameter that holds the setting, for messages.
+    The files of a command are the existing ones that it names, such as the program.
+
+    Returns:
+        {"inpainter": "<kind> <16 digits of a sha256>"}, or only the kind if the file of "lama" or "migan" cannot be
+        found. For an inpainter without files, or a pipeline, whose weights the runner hashes: {"inpainter": kind} if
+        `inpainter` has the kind "auto", else an empty dict.
     """
-    if inpainter.kind == "pipeline":
-        return [pipeline_need(str(inpainter.weights), dtype)]
-    if inpainter.kind == "command":
-        program = split_command(str(inpainter.command))[0]
-        problem = None if shutil.which(program) else f"{param}: {program} is no program that can be started here"
-        return [Need(program, problem, can_download=False)]
-    if inpainter.kind != "moebius":
-        return weights_needs(inpainter, param)
-    lacks_runtime = importlib.util.find_spec("onnxruntime") is None
-    problem = f"{param}: Moebius needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
-    try:
-        folder = find_moebius(inpainter)
-    except ValueError as error:
-        can_download = not (inpainter.weights or lacks_runtime)
-        return [Need(MOEBIUS.repo, problem or f"{param}: {error}", MOEBIUS.bytes, can_download, files=MOEBIUS.files)]
-    size = sum((folder / name).stat().st_size for name in MOEBIUS.files)
-    return [Need(str(folder), problem, size, can_download=False)]
-
-
-def reference_facts(inpainter: Inpainter) -> dict[str, str]:
-    """Return the facts about an inpainter of any kind on which results depend, in the form of `inpainter_facts`.
-
-    For Moebius the hash is that of its files, for a command that of the existing files that it names, such as the
-    program. The result is empty for a pipeline, whose weights the runner hashes.
-    """
-    if inpainter.kind == "command":
+    resolved = resolve_inpainter(inpainter)
+    if resolved.kind in PAINTERS:
+        try:
+            return {"inpainter": f"{resolved.kind} {_hash(find_file(resolved))[:16]}"}
+        except (OSError, ValueError):
+            return {"inpainter": resolved.kind}
+    if resolved.kind == "command":
         found = [shutil.which(word) or word for word in split_command(str(inpainter.command))]
         files = [Path(each) for each in found if Path(each).is_file()]
-    elif inpainter.kind == "moebius":
+    elif resolved.kind == "moebius":
         try:
             files = [find_moebius(inpainter) / name for name in MOEBIUS.files]
         except ValueError:
             files = []
     else:
-        return inpainter_facts(inpainter)
+        return {"inpainter": resolved.kind} if inpainter.kind == "auto" else {}
     digests = "".join(map(_hash, files))
-    return {"inpainter": f"{inpainter.kind} {hashlib.sha256(digests.encode()).hexdigest()[:16]}"}
+    return {"inpainter": f"{resolved.kind} {hashlib.sha256(digests.encode()).hexdigest()[:16]}"}
 
 
 def _hash(path: Path) -> str:
     """Return the sha256 of the content of a file, as hexadecimal digits."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def inpainter_facts(inpainter: Inpainter) -> dict[str, str]:
-    """Return the facts about an inpainter on which results depend: its kind and the hash of its file.
-
-    Returns:
-        {"inpainter": "<kind> <16 digits of the file's sha256>"}, or only the kind if the file cannot be found. For an
-        inpainter without a file: {"inpainter": kind} if `inpainter` has the kind "auto", else an empty dict.
-    """
-    resolved = resolve_inpainter(inpainter)
-    if resolved.kind not in PAINTERS:
-        return {"inpainter": resolved.kind} if inpainter.kind == "auto" else {}
-    try:
-        return {"inpainter": f"{resolved.kind} {_hash(find_file(resolved))[:16]}"}
-    except (OSError, ValueError):
-        return {"inpainter": resolved.kind}

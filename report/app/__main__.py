@@ -11,18 +11,16 @@ from report.app.app import App
 from report.app.server import PORT, Server, announce
 
 
+@cli.command
 def main() -> None:
     """Run `reffusion app`: serve the page until Ctrl-C, and print its address."""
     parser = cli.scene_parser("app", __doc__, needs_scene=False)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
     app = App(arguments.runs.resolve(), command=cli.typed_command("app", arguments.scene))
-    try:
-        if arguments.scene:
-            app.first = app.open(str(arguments.scene)).name
-        server = Server(app, arguments.port)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    if arguments.scene:
+        app.first = app.open(str(arguments.scene)).name
+    server = Server(app, arguments.port)
     announce(server, server.link(fragment=f"{quote(app.first)}/photographs" if app.first else ""))
     server.serve()
     sys.stdout.flush()

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from reffusion.inpaint import exemplar
 from reffusion.io.images import load_image, load_mask
 from reffusion.workspace import Workspace
 from report.app import pictures
+from report.app.mask_step import to_png
 from report.app.painting import decode_picture
 from report.app.scenes import OpenScene
 from report.sheet import stage_folder
@@ -34,7 +33,7 @@ def draw_canvas(scene: OpenScene, view: str) -> bytes:
     canvas, hole = load_image(folder / f"{view}.png"), load_mask(folder / f"{view}_mask.png")
     reference = stage_folder(scene.home, "reference") / "references" / f"{view}.png"
     filled = load_image(reference) if reference.is_file() else pictures.load_result(scene, view)
-    return _to_png(np.where(hole[..., None], filled, canvas))
+    return to_png(np.where(hole[..., None], filled, canvas))
 
 
 def fill(scene: OpenScene, view: str, content: bytes, seed: int) -> bytes:
@@ -60,17 +59,10 @@ def fill(scene: OpenScene, view: str, content: bytes, seed: int) -> bytes:
         raise ValueError("mark a part of the picture, at most half of it")
     with pictures.RENDERING:
         filled = next(exemplar.complete_view(image, hole, camera, consistent | hole, space.background, [seed])).image
-    return _to_png(np.where(hole[..., None], filled, image))
+    return to_png(np.where(hole[..., None], filled, image))
 
 
 @lru_cache(1)
 def _load_workspace(home: Path, masks: Path, changed: int) -> Workspace:
     """Return the results of the first stages; `changed` is the time at which the stage `masks` was done."""
     return Workspace(stage_folder(home, "poses"), stage_folder(home, "fit"), masks)
-
-
-def _to_png(image: np.ndarray) -> bytes:
-    """Return a picture, uint8 [H, W, 3], as PNG bytes."""
-    file = BytesIO()
-    Image.fromarray(image).save(file, "PNG", compress_level=1)
-    return file.getvalue()

@@ -124,6 +124,13 @@ def to_jpeg(image: np.ndarray, longest: int = 0) -> bytes:
     return file.getvalue()
 
 
+def to_png(image: np.ndarray) -> bytes:
+    """Return a picture, uint8 [H, W, 3] or with alpha [H, W, 4], as PNG bytes."""
+    file = BytesIO()
+    Image.fromarray(image).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
 def draw_mask(mask: np.ndarray) -> bytes:
     """Return a mask, bool [H, W], as PNG bytes: translucent inside, with an opaque border, transparent elsewhere."""
     inner = mask.copy()
@@ -131,6 +138,4 @@ def draw_mask(mask: np.ndarray) -> bytes:
     overlay = np.zeros((*mask.shape, 4), np.uint8)
     overlay[mask] = (*TINT, 110)
     overlay[mask & ~inner] = (*TINT, 255)
-    file = BytesIO()
-    Image.fromarray(overlay).save(file, "PNG", compress_level=1)
-    return file.getvalue()
+    return to_png(overlay)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import threading
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
 from reffusion.fit import exposure
 from reffusion.io.images import load_image, load_mask, load_thumbnail, to_uint8
@@ -17,7 +15,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Scene
-from report.app.mask_step import to_jpeg
+from report.app.mask_step import to_jpeg, to_png
 from report.app.scenes import OpenScene
 from report.check import overlay_masks
 from report.sheet import stage_folder
@@ -101,9 +99,7 @@ def draw_unsure(scene: OpenScene, view: str) -> bytes:
     else:
         mask = load_mask(invent) if invent.is_file() else np.zeros(load_image(photo).shape[:2], bool)
         overlay = mask[..., None] * np.array(UNSURE[255, 170, 0], np.uint8)
-    file = BytesIO()
-    Image.fromarray(overlay).save(file, "PNG", compress_level=1)
-    return file.getvalue()
+    return to_png(overlay)
 
 
 @lru_cache(KEPT)

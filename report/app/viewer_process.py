@@ -23,7 +23,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.types import Camera, Gaussians
 from reffusion.workspace import Workspace
-from report import camera_path, view
+from report import camera_path, cli, view
 from report.access import Access
 from report.app.pictures import OWN_FRAME
 from report.app.tasks import READY
@@ -103,18 +103,16 @@ class LatestViewer:
         return load_ply(path, self.scene.similarity) if path.name == OWN_FRAME else load_ply(path)
 
 
+@cli.command
 def main() -> None:
     """Serve the 3D view until standard input closes."""
     home, port, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     page, token = sys.stdin.readline().split()
     access = Access(int(page), token)
-    try:
-        with redirect_stdout(sys.stderr):  # viser prints its address
-            viewer = LatestViewer(home, port, access) if kind == "latest" else view.Viewer(home, port, access)
-        if viewer.server.get_port() != port:
-            raise ValueError(f"port {port}, on which the 3D view is shown, is in use; start this page again")
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    with redirect_stdout(sys.stderr):  # viser prints its address
+        viewer = LatestViewer(home, port, access) if kind == "latest" else view.Viewer(home, port, access)
+    if viewer.server.get_port() != port:
+        raise ValueError(f"port {port}, on which the 3D view is shown, is in use; start this page again")
     print(READY, flush=True)
     sys.stdin.read()
 

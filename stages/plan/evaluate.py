@@ -8,7 +8,7 @@ from reffusion.weights import local, painters
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Return the weights that the stage uses, each with what prevents its use on this machine (None if nothing)."""
-    painting = painters.weights_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
+    painting = painters.inpainter_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
     return [local.lpips_need(), *painting]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.params.initialize import Params
+from reffusion.params.inpainter import SEED_KINDS
 from reffusion.weights import local, painters
 from reffusion.weights.published import DEPTH_ANYTHING, PAINTERS
 
@@ -12,7 +13,7 @@ from reffusion.weights.published import DEPTH_ANYTHING, PAINTERS
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing)."""
     needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
-    return needs + (painters.weights_needs(params.inpainter, "initialize.inpainter") if params.extra_views else [])
+    return needs + (painters.inpainter_needs(params.inpainter, "initialize.inpainter") if _paints(params) else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
@@ -22,7 +23,12 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 def machine_facts(params: Params) -> dict[str, str]:
     """Return the facts of `painters.inpainter_facts`; no facts if no extra views are completed."""
-    return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
+    return painters.inpainter_facts(params.inpainter) if _paints(params) else {}
+
+
+def _paints(params: Params) -> bool:
+    """Return whether the inpainter completes extra views; those of `SEED_KINDS` leave them to patches."""
+    return bool(params.extra_views) and params.inpainter.kind not in SEED_KINDS
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:

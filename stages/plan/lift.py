@@ -10,7 +10,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing)."""
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, "float32")]
-    return painters.weights_needs(params.inpainter, "lift.inpainter")
+    return painters.inpainter_needs(params.inpainter, "lift.inpainter")
 
 
 def machine_facts(params: Params) -> dict[str, str]:

@@ -31,17 +31,17 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
         return []
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, params.dtype)]
-    return painters.reference_needs(params.inpainter, params.dtype)
+    return painters.inpainter_needs(params.inpainter, "reference.inpainter", params.dtype)
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """Return the weights of all inpainters from which `inpainter: auto` selects, whatever the parameters are."""
-    return [need for kind in PAINTERS for need in painters.weights_needs(Inpainter(kind=kind))]
+    return [need for kind in PAINTERS for need in painters.inpainter_needs(Inpainter(kind=kind))]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return the facts of `painters.reference_facts`."""
-    return painters.reference_facts(params.inpainter)
+    """Return the facts of `painters.inpainter_facts`."""
+    return painters.inpainter_facts(params.inpainter)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from reffusion.capture.normalized_frame import camera_centers
 from reffusion.io import colmap
 from reffusion.io.files import BadInput
 from reffusion.types import Scene
@@ -43,6 +45,30 @@ def run_with_messages(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
         scene, out = run_stages(folder, **params)
     sentences += [str(each.message) for each in caught]
     return scene, out, [each.replace(str(folder), "") for each in sentences]  # the path may hold any word or number
+
+
+def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Compare poses after the similarity transform of the estimate that aligns the camera centers best (least squares).
+
+    Args:
+        estimate: view -> world-to-camera pose [4, 4].
+        truth: view -> world-to-camera pose [4, 4].
+
+    Returns:
+        For the V views that both have, sorted by name: distances of centers [V] in % of the extent of the true centers
+        (the largest distance between two of these), and rotation errors [V] in degrees.
+    """
+    names = sorted(set(estimate) & set(truth))
+    poses_a, poses_b = (np.stack([poses[name] for name in names]) for poses in (estimate, truth))
+    a, b = camera_centers(poses_a), camera_centers(poses_b)
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, stretch, v = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    turn = u @ np.diag(sign) @ v
+    aligned = (stretch * sign).sum() / (a**2).sum() * a @ turn.T
+    extent = np.linalg.norm(b[:, None] - b, axis=-1).max()
+    rotations = Rotation.from_matrix(poses_b[:, :3, :3] @ turn @ poses_a[:, :3, :3].transpose(0, 2, 1))
+    return 100 * np.linalg.norm(aligned - b, axis=1) / extent, np.degrees(rotations.magnitude())
 
 
 def assert_message(sentences: Iterable[str], *words: str) -> None:

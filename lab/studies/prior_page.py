@@ -4,7 +4,7 @@ The benchmark measures the diffusion prior on holes at three *scales*: the refer
 unseen views (`whole`), and windows around the hole in unseen views (`window`). It does so before and after the prior is
 personalized to the reference.
 
-python -m report.prior runs/prior-report
+python -m lab.studies.prior_page runs/prior-report
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from reffusion.io.arrays import load_json
+from reffusion.io.arrays import load_json, save_text
 from reffusion.io.images import load_image, save_image
+from report import charts, cli, page
 from report.sheet import compose_sheet, enlarge
 
 ENLARGE = 3  # whole factor; held-out pictures have 64 px
@@ -56,9 +57,8 @@ def make(folder: Path) -> Path:
             lines += ["Personalized, with other numbers of sampler steps:", "", sampler_table(personal["sampler"])]
         for scale in SCALES:
             lines += save_sheet(folder, scale, personal["columns"])
-    page = folder / "prior.md"
-    page.write_text("\n".join(lines), encoding="utf-8")
-    return page
+    save_text(folder / "prior.md", "\n".join(lines))
+    return folder / "prior.md"
 
 
 def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
@@ -83,21 +83,19 @@ def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
     Args:
         scores: method -> kind of picture -> scores (keys of `SCORES`, "psnr_error" and "pictures", their number).
     """
-    lines = [f"| inside the hole | pictures | {' | '.join(SCORES.values())} |", "|---" * (len(SCORES) + 2) + "|"]
+    rows = []
     kinds = dict.fromkeys(kind for by_kind in scores.values() for kind in by_kind)
     for kind in kinds:
         for name, by_kind in scores.items():
             row = by_kind[kind]
-            cells = " | ".join(format_score(row, column) for column in SCORES)
-            lines.append(f"| {kind}: {name} | {row['pictures']} | {cells} |")
-    return "\n".join(lines) + "\n"
+            rows.append([f"{kind}: {name}", str(row["pictures"]), *format_scores(row)])
+    return page.markdown_table(["inside the hole", "pictures", *SCORES.values()], rows)
 
 
-def format_score(row: dict[str, float], column: str) -> str:
-    """Return a score of a row as text; PSNR with its standard error."""
-    if column == "psnr":
-        return f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
-    return f"{row[column]:.3f}"
+def format_scores(row: dict[str, float]) -> list[str]:
+    """Return the `SCORES` of a row as texts; PSNR with its standard error."""
+    psnr = f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
+    return [psnr if column == "psnr" else f"{row[column]:.3f}" for column in SCORES]
 
 
 def personalization_table(personal: dict[str, Any]) -> str:
@@ -108,17 +106,13 @@ def personalization_table(personal: dict[str, Any]) -> str:
     Args:
         personal: the entry "personalization" of prior.json.
     """
-    titles = ("clean-latent error", "variance of the SDS gradient")
-    lines = [
-        f"| holes, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
-        "|---" * (len(SCORES) + 3) + "|",
-    ]
+    rows = []
     for scale in SCALES:
         for when, row in personal[scale].items():
             figures = [f"{np.mean(row[key]):.4f}" for key in ("error", "variance")]
-            cells = [*figures, *(format_score(row["samples"], column) for column in SCORES)]
-            lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            rows.append([f"{scale}, {when}", *figures, *format_scores(row["samples"])])
+    header = [f"holes, {personal['steps']} steps", "clean-latent error", "variance of the SDS gradient"]
+    return page.markdown_table([*header, *SCORES.values()], rows)
 
 
 def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
@@ -127,15 +121,12 @@ def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
     Args:
         by_name: set of holes -> number of steps -> scores and "seconds" per picture.
     """
-    lines = [
-        f"| holes, sampler steps | {' | '.join(SCORES.values())} | CPU ms each |",
-        "|---" * (len(SCORES) + 2) + "|",
+    rows = [
+        [f"{name}, {count}", *format_scores(row), f"{1000 * row['seconds']:.0f}"]
+        for name, by_count in by_name.items()
+        for count, row in by_count.items()
     ]
-    for name, by_count in by_name.items():
-        for count, row in by_count.items():
-            cells = " | ".join(format_score(row, column) for column in SCORES)
-            lines.append(f"| {name}, {count} | {cells} | {1000 * row['seconds']:.0f} |")
-    return "\n".join(lines) + "\n"
+    return page.markdown_table(["holes, sampler steps", *SCORES.values(), "CPU ms each"], rows)
 
 
 def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
@@ -147,17 +138,15 @@ def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
     Args:
         seeds: seed -> state ("before", "after", "wrong") -> scale -> scores.
     """
-    lines = [
-        f"| holes, {len(seeds)} seeds: mean (lowest to highest) | {' | '.join(SCORES.values())} |",
-        "|---" * (len(SCORES) + 1) + "|",
-    ]
+    table = []
     whens = [when for when in ("before", "after", "wrong") if all(when in scores for scores in seeds.values())]
     for scale in SCALES:
         for when in whens:
             rows = [scores[when][scale] for scores in seeds.values()]
-            cells = (format_range([row[column] for row in rows], 2 if column == "psnr" else 3) for column in SCORES)
-            lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            cells = [format_range([row[column] for row in rows], 2 if column == "psnr" else 3) for column in SCORES]
+            table.append([f"{scale}, {when}", *cells])
+    header = [f"holes, {len(seeds)} seeds: mean (lowest to highest)", *SCORES.values()]
+    return page.markdown_table(header, table)
 
 
 def format_range(values: list[float], digits: int) -> str:
@@ -175,12 +164,8 @@ def save_charts(personal: dict[str, Any], path: Path) -> None:
         personal: the entry "personalization" of prior.json.
         path: PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure((12, 3.6), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    left, *others = figure.subplots(1, 3)
+    figure, grid = charts.new_figure(3.2, 1, 3)
+    left, *others = grid[0]
     steps = [row["iteration"] for row in personal["trace"]]
     left.plot(steps, [row["clean_latent_mse"] for row in personal["trace"]], "k.-")
     left.set(
@@ -193,18 +178,15 @@ def save_charts(personal: dict[str, Any], path: Path) -> None:
                 axes.plot(personal["timesteps"], values, style, color=color, label=f"{scale}, {when}")
         axes.set(title=f"{title}, unseen views", xlabel="timestep", ylim=(0, None))
     others[0].legend(fontsize="small")
-    canvas.draw()
-    save_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    charts.save_chart(figure, path)
 
 
+@cli.command
 def main() -> None:
     """Write the page of the measurements in a folder, and print its path."""
-    parser = argparse.ArgumentParser(prog="report.prior", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="what lab/studies/prior.py wrote to")
-    try:
-        print(make(parser.parse_args().folder))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(make(parser.parse_args().folder))
 
 
 if __name__ == "__main__":
