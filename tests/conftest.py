@@ -34,6 +34,22 @@ def mini_scene(generate, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def stages_answer_here():
+    """Let this project's stages answer the runner's questions in this process: starting one takes seconds."""
+    import json
+    from dataclasses import asdict
+
+    from runner import plan, resolve, worker
+
+    answer = lambda root, questions: json.loads(json.dumps([*map(worker._describe, questions)], default=asdict))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(Path(__file__).resolve().parent.parent)
+        for module in (plan, resolve):
+            patch.setattr(module, "ask_stages", answer)
+        yield
+
+
+@pytest.fixture(scope="module")
 def prior():
     """A small inpainting prior with random weights, shared by all tests of a module."""
     from scenes.networks import small_prior
