@@ -173,7 +173,7 @@ def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(proje
 
 def preview(""",
     )
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert set(statuses(project).values()) == {"cached"}
     write_files(project, {"data/toy/notes/idea.txt": "?"})
@@ -192,10 +192,10 @@ def scene_facts(params, scene):
 
 def preview(""",
     )
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert statuses(project)["poses"] == "run the scene's drafts changed"
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "!"})
     assert set(statuses(project).values()) == {"cached"}
 
@@ -252,14 +252,14 @@ def test_exported_files_outlive_their_artifact(project, capsys):
     invent = """,
     )
     read_drafts = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
-    run_project(capsys, project, set="masks.threshold=102")
+    run_project(capsys, project, "masks", set="masks.threshold=102")
     assert read_drafts() == {"a": "102", "b": "102"}
     (project / "runs/toy/drafts/a").write_text("drawn")
     (project / "runs/toy/drafts/mine").write_text("too")
     run_scene(make_request(project, set="masks.threshold=103"), "masks")
     assert read_drafts() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
     assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
-    run_project(capsys, project, set="masks.threshold=101")
+    run_project(capsys, project, "masks", set="masks.threshold=101")
     assert read_drafts() == {"a": "drawn", "mine": "too"}
 
 

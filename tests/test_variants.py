@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from scenes.capture import make_truth
 from scenes.capture import write_capture as write_capture
 from scenes.distill_scene import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
 from scenes.networks import save_small_prior
+from scenes.planned_runs import decide_stages, pretend_to_run
 from scenes.settings import with_changes
 from scenes.stage_runs import run_through_masks
 
@@ -32,11 +32,9 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.params.distill import LiftTerm
 from reffusion.types import PARAMETERS, Reference
-from runner.artifacts import hash_contents
 from runner.keys import Hashes
 from runner.pipeline import load_pipeline
-from runner.plan import Decision, decide
-from runner.resolve import Request, ResolvedJob, resolve
+from runner.resolve import Request, resolve
 from stages import distill, evaluate, finish, fit, initialize, lift
 from stages.plan import fit as plan_fit
 
@@ -73,13 +71,6 @@ PLANS = {
 WITH_SDS = "distill.sds.run=always"
 
 
-def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
-    decisions: dict[str, Decision] = {}
-    for stage in job.pipeline.stages:
-        decisions[stage] = decide(job, stage, decisions)
-    return decisions
-
-
 @pytest.fixture(scope="module")
 def resolve_finished(stages_answer_here, tmp_path_factory):
     """A function that resolves requests, by profile and variant, for a small scene after its own run.
@@ -90,18 +81,8 @@ def resolve_finished(stages_answer_here, tmp_path_factory):
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
     hashes = Hashes(runs / "hashes")
     resolve_one = lambda profile="laptop", **how: resolve(Request(ROOT, runs, str(scene), profile, **how), hashes)
-    job, decisions = resolve_one(set=WITH_SDS), {}
-    for stage in job.pipeline.stages:
-        decisions[stage] = decide(job, stage, decisions)
-        if decisions[stage].status == "run":
-            place = runs / "scene" / stage
-            (place / "masks").mkdir(parents=True)
-            (place / "masks" / "v00.png").write_text(stage)
-            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7}))
-            inputs = decisions[stage].inputs
-            receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
-            (place / "receipt.json").write_text(json.dumps(receipt))
-            decisions[stage] = decide(job, stage, decisions)
+    job = resolve_one(set=WITH_SDS)
+    decisions = pretend_to_run(job, job.pipeline.stages)
     assert [s for s, d in decisions.items() if d.status != "cached"] == ["lift"]
     return resolve_one
 
@@ -115,7 +96,8 @@ def test_every_variant_has_a_plan_here():
 
 @pytest.mark.parametrize("variant", PLANS)
 def test_a_variant_runs_what_it_changes_and_shares_the_rest(resolve_finished, variant):
-    decisions = decide_stages(resolve_finished(variant=variant, set=WITH_SDS))
+    job = resolve_finished(variant=variant, set=WITH_SDS)
+    decisions = decide_stages(job, job.pipeline.stages)
     runs_here, left_out = PLANS[variant]
     assert {s for s, d in decisions.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
     assert {s for s, d in decisions.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
@@ -156,9 +138,7 @@ def by_dotted_name(params):
 
 
 def test_the_papers_profile_takes_every_variant(resolve_finished):
-    lifted, plain = (
-        resolve_finished("paper", variant=v).params for v in ("lift_perceptual_diffusion", "sds_plain")
-    )
+    lifted, plain = (resolve_finished("paper", variant=v).params for v in ("lift_perceptual_diffusion", "sds_plain"))
     assert (lifted["lift"]["guidance"], lifted["lift"]["prompt"]) == (4, "A photo of a scene")
     assert "sks" not in str(plain["distill"]["prompts"]), "an unadapted prior knows sks as a rifle"
 
