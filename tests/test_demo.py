@@ -40,7 +40,7 @@ def project_by_truth(truth: dict, view: str, points: np.ndarray) -> tuple[np.nda
 
 
 def test_same_seed_same_bytes_and_old_files_go(generate, mini_scene, tmp_path):
-    again, small = tmp_path / "again", replace(generate.KINDS["mini"], test=1, train=3)
+    again, small = tmp_path / "again", replace(generate.KINDS["mini"], test=1, train=3, node=0.4)
     others = []
     for seed in (0, 1):
         generate.generate(again, seed, small)
@@ -52,7 +52,7 @@ def test_same_seed_same_bytes_and_old_files_go(generate, mini_scene, tmp_path):
 
 
 def test_a_depth_map_as_a_network_gives_it(generate, tmp_path):
-    kind = replace(generate.KINDS["mini"], depth_error=0.25, bend=0.0)
+    kind = replace(generate.KINDS["mini"], depth_error=0.25, bend=0.0, node=0.4)
     generate.generate(tmp_path / "mono", 0, kind)
     (reference,) = yaml.safe_load((tmp_path / "mono/scene.yaml").read_text())["reference"]
     name = reference["view"]
@@ -219,7 +219,7 @@ def test_floating_objects_hide_nothing_from_all_views(generate, tmp_path):
 
 def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
     with pytest.raises(ValueError, match="never seen"):
-        generate.generate(tmp_path / "scene", 0, replace(generate.KINDS["mini"], least=0.99))
+        generate.generate(tmp_path / "scene", 0, replace(generate.KINDS["mini"], least=0.99, node=0.4))
     assert not (tmp_path / "scene").exists()
 
 
