@@ -10,7 +10,14 @@ import pytest
 os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
 
+# The files that run first. Where no kernel is compiled yet, one process compiles those of splats, one those of made
+# scenes, and the other files here need none. All processes would else compile the same kernels at once.
+FIRST = ("adapted_study", "demo", "batch", "fit", "compare", "bad_input", "capture_files", "runner", "runner_faults")
+
+
 def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}.py": place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
     if os.environ.get("REFFUSION_SLOW") != "1":
         for item in items:
             if item.get_closest_marker("slow"):

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,8 @@ def sources(*folders: str) -> list[Path]:
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
-def imports(path: Path, top_only: bool = False) -> set[str]:
+@cache
+def imports(path: Path, top_only: bool = False) -> frozenset[str]:
     """Return the dotted names that a file imports, as absolute names, without those in TYPE_CHECKING blocks.
 
     Args:
@@ -89,7 +91,7 @@ def imports(path: Path, top_only: bool = False) -> set[str]:
             base = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join((*base, *filter(None, [node.module])))
             found |= {f"{module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def _nodes(tree: ast.AST, top_only: bool) -> Iterator[ast.AST]:
