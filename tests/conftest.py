@@ -10,7 +10,14 @@ import pytest
 os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
 
+# The files that run first. Where no kernel is compiled yet, one process compiles those of splats, one those of made
+# scenes, and the other files here need none. All processes would else compile the same kernels at once.
+FIRST = ("adapted_study", "demo", "batch", "fit", "compare", "bad_input", "capture_files", "runner", "runner_faults")
+
+
 def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}.py": place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
     if os.environ.get("REFFUSION_SLOW") != "1":
         for item in items:
             if item.get_closest_marker("slow"):
@@ -31,6 +38,22 @@ def mini_scene(generate, tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "mini"
     generate.generate(folder, 0, generate.KINDS["mini"])
     return folder
+
+
+@pytest.fixture(scope="module")
+def stages_answer_here():
+    """Let this project's stages answer the runner's questions in this process: starting one takes seconds."""
+    import json
+    from dataclasses import asdict
+
+    from runner import plan, resolve, worker
+
+    answer = lambda root, questions: json.loads(json.dumps([*map(worker._describe, questions)], default=asdict))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(Path(__file__).resolve().parent.parent)
+        for module in (plan, resolve):
+            patch.setattr(module, "ask_stages", answer)
+        yield
 
 
 @pytest.fixture(scope="module")

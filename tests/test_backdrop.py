@@ -1,13 +1,10 @@
 """The backdrop, a sphere of blurred colors behind the scene, and the pixels of a view that no training view saw."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
-from scenes.gaussians import join_gaussians, round_gaussians
+from scenes.gaussians import join_gaussians
 
 from reffusion import geometry
 from reffusion.background import training_coverage
@@ -32,12 +29,6 @@ def panned_camera(degrees: float) -> Camera:
     """Return a camera at the origin, turned to the right about its vertical axis by `degrees`."""
     rotation = yaw(np.radians(degrees))
     return make_camera("t", (wall_scene.WIDTH, wall_scene.HEIGHT), wall_scene.FOCAL, rotation=rotation)
-
-
-def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
-    """Return the Gaussians and one more opaque Gaussian at `mean` [3]; `sizes` [3] are its standard deviations."""
-    one = round_gaussians([mean], [color], 1.0, 4.0, gaussians.sh.shape[1])
-    return join_gaussians(gaussians, replace(one, log_scales=torch.tensor([sizes]).log()))
 
 
 def coverage_views(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:

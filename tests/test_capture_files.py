@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import unicodedata
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,57 +11,40 @@ import pytest
 from PIL import Image
 from scenes.capture import (
     HEIGHT,
-    PINHOLE,
     WIDTH,
     Truth,
+    convert_to_text,
     load_test_masks,
     make_truth,
-    run_stages,
+    reprojection_error,
     write_capture,
     write_masks,
-    write_model,
     write_pictures,
     write_poses_bounds,
     write_transforms,
 )
-from scenes.capture_checks import write_named_model
+from scenes.capture_checks import (
+    EXACT,
+    SHARE,
+    assert_cameras,
+    assert_message,
+    change_transforms,
+    rename_views,
+    run_with_messages,
+    set_in_frames,
+    write_named_model,
+)
 
 from reffusion.capture.lens import sampling_map, undistorted_pinhole
 from reffusion.capture.scene_folder import read_scene
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import load_given_mask
 from reffusion.io.images import load_mask
 from reffusion.io.ply import save_points
-from reffusion.io.scene import list_objects, load_raw_masks, load_views
+from reffusion.io.scene import list_objects, load_raw_masks
 from reffusion.params.poses import Params
-from reffusion.types import Scene
 from stages.plan import poses as plan
-
-SHARE = 1 / 16  # of a picture's pixels: `write_masks` masks this share
-
-
-def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
-    """Run the stages that read a capture; return the scene, its folder and the warnings, joined by newlines."""
-    with warnings.catch_warnings(record=True) as records:
-        warnings.simplefilter("always")
-        scene, out = run_stages(folder, **params)
-    return scene, out, "\n".join(str(each.message) for each in records)
-
-
-def assert_view_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
-    """Assert the true poses and intrinsics of all views of the scene; `views`: name in the scene -> name in `truth`."""
-    assert sorted(scene.cameras) == sorted(views)
-    similarity, at = scene.similarity, undistorted_pinhole(truth.lens)
-    for view, name in views.items():
-        camera, pose = scene.cameras[view], truth.world_to_camera[name]
-        center = similarity.invert(camera.center[None])[0]
-        np.testing.assert_allclose(center, -pose[:3, :3].T @ pose[:3, 3], atol=1e-5)
-        np.testing.assert_allclose(camera.world_to_camera[:3, :3], pose[:3, :3], atol=1e-6)
-        np.testing.assert_allclose(
-            (camera.fx, camera.fy, camera.cx, camera.cy), (at.fx, at.fy, at.cx, at.cy), rtol=1e-6
-        )
 
 
 def mask_shares(out: Path) -> dict[str, float]:
@@ -110,23 +90,13 @@ def flat_truth(views: int = 12, points: int = 400) -> Truth:
 # ---------------------------------------------------------------------------------- choice among COLMAP models
 
 
-def test_the_model_with_most_images_is_taken(tmp_path):
-    truth = make_truth(views=9)
-    folder = write_capture(tmp_path / "s", "colmap", truth)
-    (folder / "sparse/0").rename(folder / "sparse/1")
-    write_model(folder / "sparse/0", replace(truth, world_to_camera=dict([*truth.world_to_camera.items()][:3])))
-    scene, _, messages = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    assert "sparse/1 is taken, which has most images (9); not sparse/0 (3)" in messages
-
-
 def test_a_lone_model_with_another_number_is_found(tmp_path):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "colmap txt", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
-    scene, _, messages = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    assert "is taken" not in messages
+    scene, _, messages = run_with_messages(folder)
+    assert_cameras(scene, truth)
+    assert not any("is taken" in each for each in messages)
 
 
 # ------------------------------------------------------------------------------------------- names of views, folders
@@ -138,8 +108,8 @@ def test_names_of_the_model_with_folders(tmp_path, name):
     folder = write_capture(tmp_path / "s", "transforms", truth)
     (folder / "transforms.json").unlink()
     write_named_model(folder / "sparse/0", truth, {view: name.format(view) for view in truth.world_to_camera})
-    scene, out, _ = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, out, _ = run_with_messages(folder)
+    assert_cameras(scene, truth)
     assert len(mask_shares(out)) == 6
 
 
@@ -151,8 +121,8 @@ def test_pictures_in_folders(tmp_path, flat):
         write_pictures(folder / "images" / Path(each).parent, [view])
         write_masks(folder / "masks" / Path(each).parent, [view])
     write_named_model(folder / "sparse/0", truth, {view: f"{view}.png" if flat else path[view] for view in path})
-    scene, out, _ = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {view: view for view in path})
+    scene, out, _ = run_with_messages(folder)
+    assert_cameras(scene, truth)
     assert list_objects(out) == [] and len(load_raw_masks(out, scene.train)) == 6
 
 
@@ -165,23 +135,13 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
         write_masks(folder / kind / Path(each).parent, [Path(each).stem])
         (folder / kind / each).rename(folder / kind / f"{each}.png")  # COLMAP names the mask of A.png A.png.png
     write_named_model(folder / "sparse/0", truth, path)
-    scene, out, _ = run_with_warnings(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
-    assert_view_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
+    scene, out, _ = run_with_messages(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
+    assert_cameras(scene, rename_views(truth, {view: each[:-4].replace("/", "-") for view, each in path.items()}))
     assert scene.test == ("cam0-0001",) and scene.clean == {"cam1-0002"}
     assert set(mask_shares(out)) == {f"{view}.png" for view in scene.train}
     assert [*load_test_masks(out)] == ["cam0-0001"]
     with pytest.raises(BadInput, match=r"test: there is no view 'cam2/0001\.png'; views are named like cam"):
         read_scene(Params(test=["cam2/0001.png"]), folder)
-
-
-def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
-    truth = make_truth()
-    folder = write_capture(tmp_path / "s", "colmap", truth)
-    shutil.rmtree(folder / "masks")
-    for thing in ("box", "ball"):
-        write_masks(folder / "masks" / thing, truth.world_to_camera)
-    _, out, _ = run_with_warnings(folder)
-    assert list_objects(out) == ["ball", "box"]
 
 
 # ----------------------------------------------------------------------------------------- Blender's files
@@ -203,11 +163,11 @@ def test_blenders_files_with_their_split(tmp_path, splits):
         ]
         record = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / truth.lens.fx), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(record))
-    scene, _, messages = run_with_warnings(folder, masks="none")
-    of = {f"train-r_{n}": views[n] for n in range(4)} | {f"{splits[1]}-r_{n}": views[4 + n] for n in range(2)}
-    assert_view_cameras(scene, truth, of)
-    assert scene.test == tuple(sorted(view for view in of if not view.startswith("train")))
-    assert ("transforms_val.json" in messages) == (len(splits) == 3)
+    scene, _, messages = run_with_messages(folder, masks="none")
+    of = {views[n]: f"train-r_{n}" for n in range(4)} | {views[4 + n]: f"{splits[1]}-r_{n}" for n in range(2)}
+    assert_cameras(scene, rename_views(truth, of))
+    assert sorted(scene.train) == [*of.values()][:4] and sorted(scene.test) == [*of.values()][4:]
+    assert any("transforms_val.json" in each for each in messages) == (len(splits) == 3)
 
 
 # -------------------------------------------------------------------------------------------- values of mask files
@@ -218,7 +178,7 @@ def test_a_palette_with_white_first(tmp_path):
     for path in (folder / "masks").iterdir():
         Image.open(path).convert("RGB").quantize(2).save(path)
         assert Image.open(path).getpalette()[:3] == [255, 255, 255]
-    assert np.allclose([*mask_shares(run_with_warnings(folder)[1]).values()], SHARE)
+    assert np.allclose([*mask_shares(run_with_messages(folder)[1]).values()], SHARE)
 
 
 def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
@@ -228,23 +188,12 @@ def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
         numbers[40:], numbers[18:36, 24:48] = 200, 32
         Image.fromarray(numbers).save(path)
     with pytest.raises(BadInput, match=r"v00\.png: its values \(30, 32, 200\) are neither.*`masks: \{id: \.\.\.\}`"):
-        run_with_warnings(folder)
-    assert np.allclose([*mask_shares(run_with_warnings(folder, masks={"id": 32})[1]).values()], SHARE)
-    both = mask_shares(run_with_warnings(folder, masks={"folder": "masks", "id": [32, 200]})[1])
+        run_with_messages(folder)
+    assert np.allclose([*mask_shares(run_with_messages(folder, masks={"id": 32})[1]).values()], SHARE)
+    both = mask_shares(run_with_messages(folder, masks={"folder": "masks", "id": [32, 200]})[1])
     assert np.allclose([*both.values()], SHARE + 32 / 72)
     with pytest.raises(BadInput, match=r"masks: all 6 masks are empty for the id 7; correct `masks: \{id: \.\.\.\}`"):
-        run_with_warnings(folder, masks={"id": 7})
-
-
-def test_soft_edges_and_gray_objects_are_no_object_numbers(tmp_path):
-    rows, columns = np.mgrid[:100, :150]
-    soft = np.clip(400 - 8 * np.hypot(rows - 50, columns - 70), 0, 255).astype(np.uint8)
-    Image.fromarray(soft).save(tmp_path / "soft.png")
-    assert np.array_equal(load_given_mask(tmp_path / "soft.png"), soft >= 128)
-    Image.fromarray(np.where(soft >= 128, np.uint8(200), np.uint8(0))).save(tmp_path / "grey.png")
-    assert np.array_equal(load_given_mask(tmp_path / "grey.png"), soft >= 128)
-    Image.fromarray(soft).save(tmp_path / "lossy.jpg", quality=40)
-    assert (load_given_mask(tmp_path / "lossy.jpg") != (soft >= 128)).mean() < 0.01
+        run_with_messages(folder, masks={"id": 7})
 
 
 # -------------------------------------------------------------------------- references and masks beside photographs
@@ -269,9 +218,9 @@ def test_masks_beside_their_photographs(tmp_path, masks):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         path.rename(folder / "images" / f"{path.stem}_mask.png")
-    scene, out, messages = run_with_warnings(folder, masks=masks)
+    scene, out, messages = run_with_messages(folder, masks=masks)
     assert np.allclose([*mask_shares(out).values()], SHARE) and len(scene.train) == 6
-    assert "not in the model" not in messages
+    assert not any("not in the model" in each for each in messages)
 
 
 def test_photographs_are_not_their_own_masks(tmp_path):
@@ -297,22 +246,21 @@ def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
 
 def test_renamed_copies_are_paired_in_the_order_of_names(tmp_path):
     """The copies in images_4 have other names than the model's images."""
-    truth, folder = flat_truth(), tmp_path / "s"
-    views = sorted(truth.world_to_camera)
-    colors = write_textured_views(
-        folder / "images_4", truth, {view: f"image{k:03d}.png" for k, view in enumerate(views)}
-    )
-    write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(12)])
-    at = truth.lens
+    folder, numbers = tmp_path / "s", range(8, 20)  # as text, frame10 comes before frame8
+    named = {f"image{k:03d}": name for k, name in enumerate(sorted(f"frame{n}.jpg" for n in numbers))}
+    truth = rename_views(flat_truth(), dict(zip(sorted(flat_truth().world_to_camera), named, strict=True)))
+    colors = write_textured_views(folder / "images_4", truth, {view: f"{view}.png" for view in named})
+    write_masks(folder / "images_4/label", named)
+    at, view_of = truth.lens, {name: view for view, name in named.items()}
     images = {
-        k + 1: colmap.ModelImage(f"frame{k:02d}.jpg", 1, truth.world_to_camera[view]) for k, view in enumerate(views)
+        n: colmap.ModelImage(f"frame{n}.jpg", 1, truth.world_to_camera[view_of[f"frame{n}.jpg"]]) for n in numbers
     }
     cameras = {1: colmap.ModelCamera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (at.fx, at.cx, at.cy))}
     colmap.save_model(folder / "sparse/0", cameras, images, truth.points, colors)
     write_poses_bounds(folder, truth)
-    scene, _, messages = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {f"image{k:03d}": view for k, view in enumerate(views)})
-    assert "paired with the images of images.bin in order of names" in messages
+    scene, _, messages = run_with_messages(folder)
+    assert_cameras(scene, truth)
+    assert_message(messages, "paired with the images of images.bin in order of names")
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms"])
@@ -343,38 +291,13 @@ def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
     assert ("not in the frame of the cameras and are not used" in messages) == (change != "none")
 
 
-def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
-    truth, folder = make_truth(), tmp_path / "s"
-    times = ("104212", "104300", "104400")
-    names = [name for time in times for name in (f"20220819_{time}(0)", f"20220819_{time}")]
-    assert [f"{name}.jpg" for name in names] == sorted(f"{name}.jpg" for name in names)
-    write_pictures(folder / "images_4", names, ending=".jpg")
-    write_masks(folder / "images_4/label", names)
-    write_poses_bounds(folder, truth)
-    scene, _, _ = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, dict(zip(names, sorted(truth.world_to_camera), strict=True)))
-
-
 def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
-    _, out, _ = run_with_warnings(write_capture(tmp_path / "s", "colmap", make_truth()), refine=True)
+    _, out, _ = run_with_messages(write_capture(tmp_path / "s", "colmap", make_truth()), refine=True)
     assert "cameras as given: optical flow matches nothing between the views" in capsys.readouterr().out
     assert load_json(out / "refine.json") == {"before": None, "after": None}
 
 
 # ----------------------------------------------------------- Unicode names, unreadable files, camera models
-
-
-def test_composed_and_decomposed_accents_are_one_name(tmp_path):
-    truth, folder = make_truth(), tmp_path / "s"
-    views = {view: f"Küche {view}" for view in truth.world_to_camera}
-    split = {view: unicodedata.normalize("NFD", name) for view, name in views.items()}
-    write_pictures(folder / "images", split.values())
-    write_masks(folder / "masks", split.values())
-    whole = {view: unicodedata.normalize("NFC", name) for view, name in views.items()}
-    write_named_model(folder / "sparse/0", truth, {view: f"{name}.png" for view, name in whole.items()})
-    scene, out, _ = run_with_warnings(folder, test=[split["v01"]])
-    assert_view_cameras(scene, truth, {name: view for view, name in whole.items()})
-    assert len(mask_shares(out)) == 6
 
 
 @pytest.mark.parametrize(
@@ -407,8 +330,8 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
     if text:
         (folder / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n")
         (folder / "sparse/0/cameras.bin").unlink()
-    scene, _, _ = run_with_warnings(folder)
-    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, _, _ = run_with_messages(folder)
+    assert reprojection_error(scene, truth) < EXACT
     # A pixel of the undistorted picture is read where an equidistant fisheye shows the pixel's direction.
     pinhole = undistorted_pinhole(truth.lens)
     at = sampling_map(truth.lens, pinhole)[10, 20]
@@ -418,25 +341,30 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
     np.testing.assert_allclose(at, (fx * x * stretch + cx, fy * y * stretch + cy), atol=1e-9)
 
 
+@pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("model", ["SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR"])
-def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
+def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model, text):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     params = (90.0, 90.0, 48.0, 36.0, 0.1, 1.0)[: colmap.MODELS[model]]
     images = colmap.load_images(folder / "sparse/0/images.bin")
     cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
-    colmap.save_model(folder / "sparse/0", cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    with pytest.raises(BadInput, match=rf"cameras\.bin: camera model {model} is not understood; convert it to one of"):
+    if text:
+        convert_to_text(folder / "sparse/0")
+        (folder / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n")
+    else:
+        colmap.save_model(folder / "sparse/0", cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    with pytest.raises(
+        BadInput, match=rf"cameras\.(bin|txt): camera model {model} is not understood; convert it to one of"
+    ):
         plan.preview(Params(), folder)
 
 
 def test_windows_paths_in_transforms(tmp_path):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
-    save_points(folder / "sparse_pc.ply", truth.points, np.full((60, 3), 99, np.uint8))
-    record = json.loads((folder / "transforms.json").read_text()) | {"ply_file_path": ".\\sparse_pc.ply"}
-    for frame in record["frames"]:
-        frame["file_path"] = "D:\\captures\\room\\" + frame["file_path"].replace("/", "\\")
-    (folder / "transforms.json").write_text(json.dumps(record))
+    save_points(folder / "colmap/sparse_pc.ply", truth.points, np.full((60, 3), 99, np.uint8))
+    change_transforms(folder, lambda record: record.update(ply_file_path=".\\colmap\\sparse_pc.ply"))
+    set_in_frames(folder, "file_path", lambda view: f"D:\\captures\\room\\images\\{view}.png")
     capture, _ = read_scene(Params(), folder)
     assert len(capture.poses.points) == 60 and not capture.warnings and len(capture.pictures) == 6
 
@@ -444,47 +372,37 @@ def test_windows_paths_in_transforms(tmp_path):
 # -------------------------------------------------- mask and depth files of transforms.json, 16 bits
 
 
-def test_mask_path_and_depth_file_path(tmp_path):
+@pytest.mark.parametrize("place", ["keep", "masks"])
+def test_mask_path_and_depth_file_path(tmp_path, place):
+    """The folder may be called `masks`, as ours is, whose masks have the opposite sign."""
     truth, folder = flat_truth(views=6), tmp_path / "s"
     write_textured_views(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
-    write_masks(folder / "keep", truth.world_to_camera)
+    write_masks(folder / place, truth.world_to_camera)
     write_transforms(folder, truth)
-    record = json.loads((folder / "transforms.json").read_text())
-    for frame in record["frames"]:
-        view = Path(frame["file_path"]).stem
-        Image.fromarray(255 - np.array(Image.open(folder / f"keep/{view}.png"))).save(folder / f"keep/{view}.png")
+    for view in truth.world_to_camera:
+        Image.fromarray(255 - np.array(Image.open(folder / f"{place}/{view}.png"))).save(folder / f"{place}/{view}.png")
         pose, at = truth.world_to_camera[view], truth.lens
         rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         rays = np.stack([(columns - at.cx) / at.fx, (rows - at.cy) / at.fy, np.ones_like(rows)], -1) @ pose[:3, :3]
         depth = -(-pose[:3, :3].T @ pose[:3, 3])[2] / rays[..., 2]
         (folder / "depth").mkdir(exist_ok=True)
         Image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(folder / f"depth/{view}.png")
-        frame |= {"mask_path": f"keep/{view}.png", "depth_file_path": f"./depth/{view}.png"}
-    (folder / "transforms.json").write_text(json.dumps(record))
-    scene, out, messages = run_with_warnings(folder)
+    set_in_frames(folder, "mask_path", lambda view: f"{place}/{view}.png")
+    set_in_frames(folder, "depth_file_path", lambda view: f"./depth/{view}.png")
+    scene, out, messages = run_with_messages(folder)
     assert np.allclose([*mask_shares(out).values()], SHARE)
-    assert "mask_path of transforms.json: black, which training ignores, is taken for the object" in messages
+    assert_message(messages, "mask_path of transforms.json: black, which training ignores, is taken for the object")
     points = scene.similarity.invert(scene.points)
     assert len(points) > 5000 and np.abs(points[:, 2]).max() < 2e-3, "on the plane z = 0, to the millimetre"
-    assert f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json" in messages
-
-
-def test_a_16_bit_gray_photograph(tmp_path):
-    folder = write_capture(tmp_path / "s", "colmap", make_truth(PINHOLE))
-    levels = np.tile(np.linspace(0, 65535, WIDTH).astype(np.uint16), (HEIGHT, 1))
-    Image.fromarray(levels).save(folder / "images/v02.png")
-    _, out, _ = run_with_warnings(folder)
-    assert np.array_equal(load_views(out, ["v02"])["v02"][..., 1], np.round(levels / 257).astype(np.uint8))
+    assert_message(messages, f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json")
 
 
 def test_pictures_that_no_frame_lists_are_named_and_need_no_masks(tmp_path):
     folder = write_capture(tmp_path / "s", "transforms", make_truth())
-    record = json.loads((folder / "transforms.json").read_text())
-    picture = Path(record["frames"].pop()["file_path"]).name
-    (folder / "transforms.json").write_text(json.dumps(record))
-    scene, _, messages = run_with_warnings(folder)
-    assert len(scene.cameras) == len(record["frames"])
-    assert f"1 pictures are not in transforms.json and are left out: {picture}" in messages
+    change_transforms(folder, lambda record: record["frames"].pop())  # they are listed from the last to the first
+    scene, _, messages = run_with_messages(folder)
+    assert len(scene.cameras) == 5
+    assert_message(messages, "1 pictures are not in transforms.json and are left out: v00.png")
 
 
 def test_views_with_masks_of_only_some_objects_are_named(tmp_path):
@@ -493,5 +411,6 @@ def test_views_with_masks_of_only_some_objects_are_named(tmp_path):
     (folder / "masks").mkdir()
     boxes.rename(folder / "masks/box")
     write_masks(folder / "masks/ball", [path.stem for path in sorted((folder / "masks/box").iterdir())[1:]])
-    _, _, messages = run_with_warnings(folder)
-    assert "1 training views have masks of only some objects, which do not count: v00; add empty masks" in messages
+    _, _, messages = run_with_messages(folder)
+    said = "1 training views have masks of only some objects, which do not count: v00; add empty masks"
+    assert_message(messages, said)

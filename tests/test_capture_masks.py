@@ -26,23 +26,18 @@ from scenes.capture import (
 )
 from scenes.capture_checks import (
     OBJECT,
-    SHARE,
     assert_cameras,
     assert_masked_views,
     assert_message,
-    masked_share,
     refusal_before_writing,
     refusal_message,
     rename_views,
     run_with_messages,
-    write_named_model,
 )
-from scenes.room import render_room_corner, room_walk, speckle_texture
 
 from reffusion.capture.scene_folder import read_scene
 from reffusion.io.files import BadInput
 from reffusion.io.given_masks import load_given_mask
-from reffusion.io.images import save_image
 from reffusion.params.poses import Params
 from stages import raw_masks
 from stages.plan import raw_masks as raw_masks_plan
@@ -106,13 +101,6 @@ def test_two_object_numbers_of_16_bits(tmp_path):
     truth = write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
     _, out, _ = run_with_messages(tmp_path / "s", masks={"id": [3, 1024]})
     assert_masked_views(out, truth.world_to_camera)
-
-
-def test_antialiased_outlines_are_no_object_numbers(tmp_path):
-    soft = cv2.GaussianBlur(255 * OBJECT.astype(np.uint8), (0, 0), 0.8)
-    truth = write_capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
-    _, out, _ = run_with_messages(tmp_path / "s")
-    assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
 
 
 # ------------------------------------------------------------------------- masks that are no pictures, or lie beside
@@ -362,60 +350,6 @@ def test_two_references_beside_pictures_of_llff(tmp_path):
 
 
 # ------------------------------------------------------------------- pictures paired with poses by order
-
-
-def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
-    folder, truth = tmp_path / "s", make_truth()
-    stems = [f"frame_{k:05d}" for k in range(6)]
-    write_pictures(folder / "images", stems, ending=".jpg")
-    write_masks(folder / "masks", stems)
-    names = {v: f"DJI_{10 * k:04d}_V.JPG" for k, v in enumerate(sorted(truth.world_to_camera))}
-    write_named_model(folder / "sparse/0", truth, names, text=True)
-    assert_message([refusal_message(folder)], "images")
-
-
-def write_corner_capture(folder: Path, order: list[int]) -> Truth:
-    """Write a capture of a room's corner whose pictures and COLMAP images have different names; return the truth.
-
-    The model has the images IMG_8.JPG to IMG_13.JPG, and points with the colors of the pictures. The picture
-    images_4/image00k.png shows view number `order[k]`.
-    """
-    generator, cameras = np.random.default_rng(5), room_walk(6)
-    textures = np.stack([cv2.GaussianBlur(speckle_texture(generator), (0, 0), 5) for _ in range(3)])
-    textures = 255 * (textures - textures.min()) / np.ptp(textures)
-    pictures = [render_room_corner(pose, textures, (WIDTH, HEIGHT), 90.0) for pose in cameras.values()]
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(4, WIDTH, 9), np.arange(4, HEIGHT, 9)))
-    rays = np.stack([(columns + 0.5 - WIDTH / 2) / 90, (rows + 0.5 - HEIGHT / 2) / 90, np.ones(len(rows))], -1)
-    points, colors = [], []
-    for pose, picture in zip(cameras.values(), pictures, strict=True):
-        directions, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-        times = (np.array([2.0, 1.5, 3.0]) - center) / directions
-        points.append(center + directions * np.where(times > 0, times, np.inf).min(-1, keepdims=True))
-        colors.append(picture[rows, columns])
-    truth = Truth(cameras, np.concatenate(points), ("SIMPLE_PINHOLE", (90.0, WIDTH / 2, HEIGHT / 2)))
-    write_named_model(folder / "sparse/0", truth, {v: f"IMG_{8 + k}.JPG" for k, v in enumerate(cameras)})
-    recolor(folder / "sparse/0/points3D.bin", np.concatenate(colors))
-    for k, chosen in enumerate(order):
-        save_image(folder / f"images_4/image{k:03d}.png", pictures[chosen])
-    write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(6)])
-    return rename_views(truth, {f"p{chosen}": f"image{k:03d}" for k, chosen in enumerate(order)})
-
-
-def recolor(path: Path, colors: np.ndarray) -> None:
-    from reffusion.io.colmap import POINT
-
-    data = path.read_bytes()
-    records = np.frombuffer(data[8:], POINT).copy()
-    records["rgb"] = colors
-    path.write_bytes(data[:8] + records.tobytes())
-
-
-def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
-    """Names are sorted as text: IMG_10.JPG comes before IMG_8.JPG."""
-    truth = write_corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
-    scene, _, sentences = run_with_messages(tmp_path / "s")
-    assert_cameras(scene, truth)
-    assert_message(sentences, "order")
 
 
 @pytest.mark.parametrize("marked", ["clicks", "masks"])

@@ -26,11 +26,13 @@ from scenes.capture_checks import (
     assert_cameras,
     assert_masked_views,
     assert_message,
+    change_transforms,
     convert_to_text,
     masked_share,
     rename_views,
     run_with_messages,
     select_views,
+    set_in_frames,
     write_mask,
     write_named_model,
 )
@@ -49,10 +51,7 @@ def truth_in_other_frame(views: int) -> Truth:
 def write_transforms_with_paths(folder: Path, truth: Truth, paths: dict[str, str]) -> None:
     """Write transforms.json whose frames have the given paths; `paths`: view -> file_path."""
     write_transforms(folder, truth)
-    record = json.loads((folder / "transforms.json").read_text())
-    for frame in record["frames"]:
-        frame["file_path"] = paths[Path(frame["file_path"]).stem]
-    (folder / "transforms.json").write_text(json.dumps(record))
+    set_in_frames(folder, "file_path", paths.get)
 
 
 # ------------------------------------------------------------------------------------------------- several models
@@ -68,7 +67,7 @@ def test_largest_of_three_models_that_nerfstudio_left(tmp_path):
     scene, _, sentences = run_with_messages(folder)
     assert scene.train == tuple(f"v{k:02d}" for k in range(1, 8))
     assert_cameras(scene, select_views(truth, 1, 8))
-    assert_message(sentences, "sparse", "1", "0", "2")
+    assert_message(sentences, "sparse/1 is taken, which has most images (7)", "0", "2")
 
 
 def test_two_digit_model_beside_masks_of_images_4(tmp_path):
@@ -132,19 +131,6 @@ def test_absolute_windows_paths_and_other_case(tmp_path):
 # ------------------------------------------------------------------------------------------------- masks in folders
 
 
-def test_masks_by_colmaps_rule_for_equal_names(tmp_path):
-    folder, truth = tmp_path / "s", make_truth()
-    paths = {v: f"site/cam{k % 3}/A{k // 3}.jpg" for k, v in enumerate(sorted(truth.world_to_camera))}
-    write_pictures(folder / "images", [path.removesuffix(".jpg") for path in paths.values()], ending=".jpg")
-    for path in paths.values():
-        write_mask(folder / "masks" / f"{path}.png")
-    write_named_model(folder / "sparse/0", truth, paths)
-    scene, out, _ = run_with_messages(folder)
-    views = [path.removesuffix(".jpg").replace("/", "-") for path in paths.values()]
-    assert list_objects(out) == [] and sorted(scene.train) == sorted(views)
-    assert_masked_views(out, views)
-
-
 def test_masks_of_one_day_only(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     days = {v: f"2024-05-0{1 + k // 3}/IMG_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
@@ -158,16 +144,6 @@ def test_masks_of_one_day_only(tmp_path):
     assert_message(sentences, "3", "no mask", "IMG_4")
 
 
-def test_folders_of_objects_stay_objects(tmp_path):
-    folder, truth = tmp_path / "s", make_truth()
-    write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
-    for thing in ("chair", "lamp"):
-        write_masks(folder / "masks" / thing, truth.world_to_camera)
-    write_model(folder / "sparse/0", truth)
-    _, out, _ = run_with_messages(folder, remove=["lamp"])
-    assert list_objects(out) == ["chair", "lamp"]
-
-
 # ------------------------------------------------------------------------------------------------- Blender's files
 
 
@@ -175,26 +151,6 @@ def blender_frames(truth: Truth, paths: dict[str, str]) -> list[dict]:
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     pose = lambda view: (np.linalg.inv(truth.world_to_camera[view]) @ flip).tolist()
     return [{"file_path": path, "rotation": 0.0125, "transform_matrix": pose(v)} for v, path in paths.items()]
-
-
-def test_nerf_synthetic_with_three_splits_of_equal_names(tmp_path):
-    folder, truth = tmp_path / "s", make_truth(views=8)
-    counts, views = {"train": 4, "test": 2, "val": 2}, sorted(truth.world_to_camera)
-    named, angle = {}, 2 * float(np.arctan(WIDTH / 2 / truth.lens.fx))
-    for split, count in counts.items():
-        paths = {views.pop(0): f"{split}/r_{k}" for k in range(count)}
-        (folder / split).mkdir(parents=True)
-        for path in paths.values():
-            Image.new("RGBA", (WIDTH, HEIGHT), (90, 120, 60, 255)).save(folder / f"{path}.png")
-        listed = blender_frames(truth, {v: f"./{path}" for v, path in paths.items()})
-        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": listed}))
-        named |= {v: path.replace("/", "-") for v, path in paths.items() if split != "val"}
-    assert load_capture(folder).layout == "transforms"
-    scene, _, sentences = run_with_messages(folder, masks="none")
-    assert scene.train == ("train-r_0", "train-r_1", "train-r_2", "train-r_3")
-    assert scene.test == ("test-r_0", "test-r_1")
-    assert_cameras(scene, rename_views(truth, named))
-    assert_message(sentences, "val")
 
 
 def test_addon_that_writes_validation_but_no_test(tmp_path):
@@ -292,12 +248,6 @@ def test_uncommon_intrinsics_are_read(tmp_path, changes):
 
 
 # ----------------------------------------------------------------------------------------------- wrong transforms.json
-
-
-def change_transforms(folder: Path, change: Callable[[dict], object]) -> None:
-    record = json.loads((folder / "transforms.json").read_text())
-    change(record)
-    (folder / "transforms.json").write_text(json.dumps(record))
 
 
 WRONG: dict[str, tuple[Callable[[dict], object], str]] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import unicodedata
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +29,7 @@ from scenes.capture_checks import (
     masked_views,
     rename_views,
     run_with_messages,
+    set_in_frames,
     write_mask,
     write_named_model,
 )
@@ -55,29 +55,7 @@ def test_points_in_millimetres_beside_cameras_in_metres(tmp_path):
     assert_points_near(scene, sentences, "points3D")
 
 
-def test_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
-    folder, truth = tmp_path / "s", make_truth()
-    write_capture(folder, "llff+bin", truth)
-    utm = truth.points[:, [0, 2, 1]] * (1, 1, -1) + (448_262.0, 5_411_932.0, 35.0)
-    write_model(folder / "sparse/0", replace(truth, points=np.repeat(utm, 3, 0)), factor=4)
-    scene, _, sentences = run_with_messages(folder)
-    assert_cameras(scene, truth)
-    assert_points_near(scene, sentences, "points3D")
-
-
 # ------------------------------------------------------------------------------------- masks beside photographs
-
-
-def test_masks_beside_photographs_without_a_key(tmp_path):
-    folder, truth = tmp_path / "s", make_truth()
-    write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
-    for view in truth.world_to_camera:
-        write_mask(folder / "images" / f"{view}_mask.png")
-    write_model(folder / "sparse/0", truth)
-    scene, out, sentences = run_with_messages(folder)
-    assert scene.train == tuple(sorted(truth.world_to_camera))
-    assert_masked_views(out, truth.world_to_camera)
-    assert not any("not in the model" in sentence for sentence in sentences)
 
 
 def test_masks_beside_pictures_of_llff(tmp_path):
@@ -156,10 +134,7 @@ def test_transforms_json_and_masks_from_another_system(tmp_path):
     for name in names.values():
         write_mask(folder / "masks" / f"{name}.png.png")
     write_transforms(folder, truth)
-    record = json.loads((folder / "transforms.json").read_text())
-    for frame in record["frames"]:
-        frame["file_path"] = f"images/{names[Path(frame['file_path']).stem]}.png"
-    (folder / "transforms.json").write_text(json.dumps(record))
+    set_in_frames(folder, "file_path", lambda view: f"images/{names[view]}.png")
     scene, out, _ = run_with_messages(folder, test=[names["v03"]])
     assert [to_nfc(view) for view in scene.test] == [names["v03"]]
     assert_cameras_by_nfc(scene, truth, names)

@@ -24,6 +24,7 @@ from scenes.capture import (
     write_pictures,
     write_transforms,
 )
+from scenes.capture_checks import change_transforms
 
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.load import detect_layout, load_capture
@@ -203,12 +204,6 @@ def test_spherical_cameras_of_opensfm(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------- transforms files
-
-
-def change_transforms(folder: Path, change: Callable[[dict], object]) -> None:
-    record = json.loads((folder / "transforms.json").read_text())
-    change(record)
-    (folder / "transforms.json").write_text(json.dumps(record))
 
 
 def change_matrices(folder: Path, change: Callable[[np.ndarray], np.ndarray], frames: slice = slice(None)) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from test_demo_places import photograph_scene, shrink_kind
 
 from reffusion.io import colmap
 from reffusion.io.given_masks import load_given_mask
@@ -39,18 +40,19 @@ def project_by_truth(truth: dict, view: str, points: np.ndarray) -> tuple[np.nda
 
 
 def test_same_seed_same_bytes_and_old_files_go(generate, mini_scene, tmp_path):
-    again = tmp_path / "again"
-    generate.generate(again, 1, generate.KINDS["mini"])
-    other = read_files(again)
+    again, small = tmp_path / "again", replace(generate.KINDS["mini"], test=1, train=3, node=0.4)
+    others = []
+    for seed in (0, 1):
+        generate.generate(again, seed, small)
+        others.append((again / "images_4/IMG_2003.png").read_bytes())
+    assert others[0] != others[1]
     (again / "images_4" / "stale.png").write_bytes(b"")
     generate.generate(again, 0, generate.KINDS["mini"])
     assert read_files(again) == read_files(mini_scene)
-    name = "images_4/IMG_2005.png"
-    assert other[name] != read_files(mini_scene)[name]
 
 
 def test_a_depth_map_as_a_network_gives_it(generate, tmp_path):
-    kind = replace(generate.KINDS["mini"], depth_error=0.25, bend=0.0)
+    kind = replace(generate.KINDS["mini"], depth_error=0.25, bend=0.0, node=0.4)
     generate.generate(tmp_path / "mono", 0, kind)
     (reference,) = yaml.safe_load((tmp_path / "mono/scene.yaml").read_text())["reference"]
     name = reference["view"]
@@ -143,13 +145,18 @@ def test_only_masked_pixels_change_when_the_object_goes(generate, mini_scene):
     assert (photo[mask] != reference[mask]).any(1).mean() > 0.9
 
 
-def test_test_views_are_without_the_object(generate, mini_scene):
+@pytest.fixture(scope="module")
+def mini_world(generate):
+    """The world of `mini_scene`, and the point that its cameras look at."""
+    furniture, target = generate.furnish(0, generate.KINDS["mini"])
+    return generate.bake(furniture, 0, generate.KINDS["mini"]), target
+
+
+def test_test_views_are_without_the_object(generate, mini_scene, mini_world):
     """A test view rendered again with the object differs inside its mask, and only inside its mask."""
     from lab.scenes import photographs
 
-    kind = generate.KINDS["mini"]
-    furniture, target = generate.furnish(0, kind)
-    world = generate.bake(furniture, 0, kind)
+    kind, (world, target) = generate.KINDS["mini"], mini_world
     train, test = (
         photographs.path(0, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test"))
     )
@@ -163,17 +170,15 @@ def test_test_views_are_without_the_object(generate, mini_scene):
         assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
 
 
-def test_never_seen_pixels_are_never_seen(generate, mini_scene):
+def test_never_seen_pixels_are_never_seen(generate, mini_scene, mini_world):
     """The background of a pixel in truth/never_seen is masked or occluded in every training view.
 
     The test projects the background points by truth/cameras.json and not by the generator's own code.
     """
     from lab.scenes import photographs, raycast
 
-    kind = generate.KINDS["mini"]
+    kind, (world, target), frame = generate.KINDS["mini"], mini_world, generate.scene_frame(0)
     truth = json.loads((mini_scene / "truth/cameras.json").read_text())
-    furniture, target = generate.furnish(0, kind)
-    world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
     cameras = photographs.path(0, kind, target, kind.test, "test")
     training = {
         name: load_given_mask(mini_scene / f"images_4/label/{name}.png")
@@ -198,21 +203,15 @@ def test_never_seen_pixels_are_never_seen(generate, mini_scene):
 
 
 @pytest.mark.parametrize("name", ["demo", "wide", "360"])
-def test_two_fifths_of_the_mask_are_never_seen(generate, tmp_path, name):
-    kind = replace(
-        generate.KINDS[name], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
-    )
+def test_two_fifths_of_the_mask_are_never_seen(generate, name):
     for seed in (0, 11):
-        facts = generate.generate(tmp_path / f"{name}{seed}", seed, kind)
+        facts = generate._facts(seed, photograph_scene(name, seed)[2])
         assert min(facts["never_seen_share"].values()) >= 0.4
         assert 0.06 < facts["mask_share"]["train"] < 0.25
 
 
 def test_floating_objects_hide_nothing_from_all_views(generate, tmp_path):
-    kind = replace(
-        generate.KINDS["seen"], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
-    )
-    facts = generate.generate(tmp_path / "seen", 0, kind)
+    facts = generate.generate(tmp_path / "seen", 0, shrink_kind(generate.KINDS["seen"]))
     assert max(facts["never_seen_share"].values()) <= generate.MOST_NEVER_SEEN < 0.01
     assert facts["mask_share"]["train"] > 0.01
     assert "reference" not in yaml.safe_load((tmp_path / "seen/scene.yaml").read_text())
@@ -220,7 +219,7 @@ def test_floating_objects_hide_nothing_from_all_views(generate, tmp_path):
 
 def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
     with pytest.raises(ValueError, match="never seen"):
-        generate.generate(tmp_path / "scene", 0, replace(generate.KINDS["mini"], least=0.99))
+        generate.generate(tmp_path / "scene", 0, replace(generate.KINDS["mini"], least=0.99, node=0.4))
     assert not (tmp_path / "scene").exists()
 
 
@@ -229,8 +228,7 @@ def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_pa
 
     For outpainting, the mask covers all pixels outside the disc of a sphere.
     """
-    stamp = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}
-    scenes = {}
+    stamp, scenes = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}, {}
     for name in ("insert", "outpaint"):
         generate.generate(tmp_path / name, 0, replace(generate.KINDS[name], **stamp, node=0.4))
         scenes[name] = yaml.safe_load((tmp_path / name / "scene.yaml").read_text())

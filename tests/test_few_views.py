@@ -223,28 +223,3 @@ def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train,
         error[way] = np.abs(rendering - render_wall_and_square(view)[1] / 255)[8:-8, 16:-16].mean()
     assert error["surfaces"] < 0.5 * error["fewer_harmonics"]
     assert "Gaussians on surfaces between 760 points" in capsys.readouterr().out
-
-
-def test_an_interrupted_fit_from_surfaces_goes_on_to_the_same_end(tmp_path, monkeypatch):
-    write_room_poses(tmp_path / "poses", ("v0", "v1"))
-    params = Params(iterations=60, few_views="surfaces", checkpoint_seconds=0.001)
-    for name in ("whole", "broken"):
-        (tmp_path / name).mkdir()
-    stage.run(params, tmp_path / "whole", poses=tmp_path / "poses")
-    from reffusion.fit import reconstruction
-
-    steps, do = [], reconstruction.step
-
-    def stopping(*arguments):
-        steps.append(arguments)
-        if len(steps) == 7:
-            raise KeyboardInterrupt
-        return do(*arguments)
-
-    monkeypatch.setattr(reconstruction, "step", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        stage.run(params, tmp_path / "broken", poses=tmp_path / "poses")
-    monkeypatch.setattr(reconstruction, "step", do)
-    stage.run(params, tmp_path / "broken", poses=tmp_path / "poses")
-    whole, broken = (load_ply(tmp_path / name / "gaussians.ply") for name in ("whole", "broken"))
-    assert torch.equal(whole.means, broken.means) and torch.equal(whole.sh, broken.sh)

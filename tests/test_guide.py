@@ -27,21 +27,13 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def photo_folder(generate, tmp_path_factory) -> Path:
-    """A folder with photographs and their masks."""
-    folder = tmp_path_factory.mktemp("guide") / "my-photos"
-    generate.generate(folder, 0, generate.KINDS["mini"])
-    return folder
+def make_command(command: str, mini_scene: Path) -> list[str]:
+    words = [f"scene={mini_scene}" if word.startswith("scene=") else word for word in command.split()]
+    return [*words, f"runs={mini_scene.parent / 'runs'}", "profile=laptop", f"set={LITTLE}", f"VENV={sys.prefix}"]
 
 
-def make_command(command: str, photo_folder: Path) -> list[str]:
-    words = [f"scene={photo_folder}" if word.startswith("scene=") else word for word in command.split()]
-    return [*words, f"runs={photo_folder.parent / 'runs'}", "profile=laptop", f"set={LITTLE}", f"VENV={sys.prefix}"]
-
-
-def run_make(command: str, photo_folder: Path) -> str:
-    done = subprocess.run(make_command(command, photo_folder), cwd=ROOT, capture_output=True, text=True)
+def run_make(command: str, mini_scene: Path) -> str:
+    done = subprocess.run(make_command(command, mini_scene), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -51,30 +43,30 @@ def test_the_guide_names_these_commands():
     assert all(command.split()[1] == "scene=my-photos" for command in COMMANDS)
 
 
-def test_short_commands_run(photo_folder):
-    assert "fit" in run_make(*(c for c in COMMANDS if c.endswith("plan")), photo_folder)
-    run_make(*(c for c in COMMANDS if c.endswith("check")), photo_folder)
-    assert (photo_folder.parent / "runs/my-photos/check.png").is_file()
+def test_short_commands_run(mini_scene):
+    assert "fit" in run_make(*(c for c in COMMANDS if c.endswith("plan")), mini_scene)
+    run_make(*(c for c in COMMANDS if c.endswith("check")), mini_scene)
+    assert (mini_scene.parent / "runs/mini/check.png").is_file()
 
 
-def test_the_mask_page(photo_folder):
+def test_the_mask_page(mini_scene):
     (command,) = (c for c in COMMANDS if c.endswith("mask"))
     group = {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen([*make_command(command, photo_folder), "port=18390"], cwd=ROOT, **group) as serving:
+    with subprocess.Popen([*make_command(command, mini_scene), "port=18390"], cwd=ROOT, **group) as serving:
         try:
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
-            page = urljoin(address, f"/scenes/my-photos/mask/?{urlsplit(address).query}")
-            assert address.endswith("#my-photos/object")
+            page = urljoin(address, f"/scenes/mini/mask/?{urlsplit(address).query}")
+            assert address.endswith("#mini/object")
             assert "What should be removed?" in urllib.request.urlopen(page, timeout=20).read().decode()
         finally:
             os.killpg(serving.pid, signal.SIGTERM)  # not SIGINT, which a test runner may ignore and pass on
 
 
 @pytest.mark.slow
-def test_long_commands_run(photo_folder):
+def test_long_commands_run(mini_scene):
     for goal, made in (("reference", "to_paint"), ("all", "evaluate/scene.ply"), ("report", "report.html")):
-        run_make(*(c for c in COMMANDS if c.endswith(goal)), photo_folder)
-        assert goal == "reference" or (photo_folder.parent / "runs/my-photos" / made).exists()
+        run_make(*(c for c in COMMANDS if c.endswith(goal)), mini_scene)
+        assert goal == "reference" or (mini_scene.parent / "runs/mini" / made).exists()
 
 
 def test_pictures_are_there_and_small():

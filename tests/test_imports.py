@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,6 @@ import pytest
 from runner.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
-OWN = {"reffusion", "stages", "runner", "report"}
 # Heavy or special dependencies, and the only modules that may import them: one module for each dependency, and for
 # transformers one for priors and one for other networks.
 DOORS = {
@@ -58,13 +58,20 @@ PURE = (
     "distill/terms/",
     "prior/windows",
 )  # these modules use tensors and plain numbers only
+# what the pipeline computes with, and report/ does not
+METHODS = (
+    "stages.",
+    "reffusion.fit.reconstruction",
+    *(f"reffusion.{each}." for each in ("depth", "distill", "gaussians", "initialize", "masks", "metrics", "shadows")),
+)
 
 
 def sources(*folders: str) -> list[Path]:
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
-def imports(path: Path, top_only: bool = False) -> set[str]:
+@cache
+def imports(path: Path, top_only: bool = False) -> frozenset[str]:
     """Return the dotted names that a file imports, as absolute names, without those in TYPE_CHECKING blocks.
 
     Args:
@@ -80,7 +87,7 @@ def imports(path: Path, top_only: bool = False) -> set[str]:
             base = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join((*base, *filter(None, [node.module])))
             found |= {f"{module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def _nodes(tree: ast.AST, top_only: bool) -> Iterator[ast.AST]:
@@ -102,18 +109,14 @@ def relative_path(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("path", sources("runner"), ids=relative_path)
-def test_runner_knows_nothing_of_3d(path):
-    clusters = {name for name, doors in DOORS.items() if relative_path(path) in doors}
-    assert foreign_packages(path, {"runner", "reffusion", "pydantic", "yaml"} | clusters) == set()
-    own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
-    assert own <= {
-        "reffusion.command",
-        "reffusion.command.is_installed",
-        "reffusion.command.scene_name",
-        "reffusion.command.scene_path",
-        "reffusion.command.workplace",
-    }
+def test_runner_knows_nothing_of_3d():
+    allowed = {"runner", "reffusion", "pydantic", "yaml"}
+    command = {f"reffusion.command.{name}" for name in ("is_installed", "scene_name", "scene_path", "workplace")}
+    for path in sources("runner"):
+        clusters = {name for name, doors in DOORS.items() if relative_path(path) in doors}
+        assert foreign_packages(path, allowed | clusters) == set(), path
+        own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
+        assert own <= {"reffusion.command", *command}, path
 
 
 def test_only_the_command_line_knows_the_fleet():
@@ -122,11 +125,11 @@ def test_only_the_command_line_knows_the_fleet():
     assert not [path for path in core if any(name.startswith("runner.fleet") for name in imports(path))]
 
 
-@pytest.mark.parametrize("path", sources("stages"), ids=relative_path)
-def test_stages_import_the_library_only(path):
-    names = imports(path)
-    assert foreign_packages(path, {"reffusion", "numpy", "torch"}) == set() and "argparse" not in names
-    assert imports(path, top_only=True) == names, "imports stand at the top"
+def test_stages_import_the_library_only():
+    for path in sources("stages"):
+        names = imports(path)
+        assert foreign_packages(path, {"reffusion", "numpy", "torch"}) == set() and "argparse" not in names, path
+        assert imports(path, top_only=True) == names, f"{path}: imports stand at the top"
 
 
 @pytest.mark.parametrize("stage", [path.stem for path in sources("stages/plan") if path.stem != "__init__"])
@@ -165,60 +168,40 @@ def test_init_files_are_empty():
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
-def test_library_imports_no_upper_layer(path):
-    names = {name.split(".")[0] for name in imports(path)}
-    assert not names & {"stages", "runner", "report", "yaml", "argparse"}
-    for package, doors in DOORS.items():
-        assert package not in names or relative_path(path) in doors, f"only {' and '.join(doors)} import {package}"
+def test_library_imports_no_upper_layer():
+    for path in sources("reffusion"):
+        names = {name.split(".")[0] for name in imports(path)}
+        assert not names & {"stages", "runner", "report", "yaml", "argparse"}, path
+        for package, doors in DOORS.items():
+            assert package not in names or relative_path(path) in doors, f"{path}: only {doors} import {package}"
 
 
 def test_command_imports_only_the_standard_library():
     assert foreign_packages(ROOT / "reffusion" / "command.py", set()) == set()
 
 
-@pytest.mark.parametrize("path", sources("report"), ids=relative_path)
-def test_report_reads_through_io(path):
-    own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = ("camera_path", "turntable", "view", "job_pictures", "gaussian_layers", "unseen_overlay", "study")
-    drawing_names = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
-    drawing = drawing_names if path.stem in draws else ()
-    drawing += ("reffusion.trace",) if path.stem == "turntable" else ()  # for the progress bar
-    places = ("reffusion.command",) if path.stem == "cli" else ()  # for the path of the folder of scenes
-    clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
-    making = clicked if path.stem == "mask_session" else ()  # to make masks
-    page = ("reffusion.command", "reffusion.capture.load", "reffusion.capture.roles")
-    page += ("reffusion.clicks.local_segmenter", "reffusion.weights")
-    page += ("reffusion.references.files", "runner.files", "runner.frames", "runner.plan")
-    # The page runs the runner, shows captures before any stage has run, and renders views.
-    page += ("reffusion.workspace", "reffusion.inpaint.exemplar")  # to fill what a user marks
-    app = (*page, *drawing_names, "reffusion.fit.exposure") if path.parent.name == "app" else ()
-    painting = ("reffusion.inpaint", "reffusion.prior", "reffusion.params", "reffusion.weights", "reffusion.command")
-    tried = painting if path.stem == "doctor" else ()  # to let each inpainter paint
-    cutting = ("reffusion.capture", "reffusion.command") if path.stem == "panoramas" else ()  # to make views
-    # For the random order of pairs, and for confidence intervals.
-    chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()
-    assert all(
-        name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app, *tried, *cutting)) for name in own
-    ), own
+def test_report_runs_no_method_of_the_pipeline():
+    """It reads results and draws them. Only its page lets the runner make new ones."""
+    for path in sources("report"):
+        names = {name for name in imports(path) if name.startswith(METHODS)}
+        names |= {name for name in imports(path) if name.startswith("runner.") and path.parent.name != "app"}
+        assert not names, f"{path}: {names}"
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
-def test_files_are_opened_in_io_and_trace(path):
-    if relative_path(path).startswith((*MAY_OPEN, *OWN_FILES)):
-        return
-    calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
-    opened = {f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "") for f in calls} & OPENERS
-    opened |= {text for f in calls if (text := ast.unparse(f)) in
-               ("np.load", "np.save", "numpy.load", "torch.load", "torch.save", "json.load", "json.dump")}  # fmt: skip
-    assert opened == set()
+def test_files_are_opened_in_io_and_trace():
+    others = ("np.load", "np.save", "numpy.load", "torch.load", "torch.save", "json.load", "json.dump")
+    for path in sources("reffusion"):
+        if relative_path(path).startswith((*MAY_OPEN, *OWN_FILES)):
+            continue
+        calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
+        opened = {f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "") for f in calls} & OPENERS
+        assert opened | {text for f in calls if (text := ast.unparse(f)) in others} == set(), path
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
-def test_pure_modules_take_no_paths_and_no_params(path):
-    inside = relative_path(path).removeprefix("reffusion/")
-    if inside.startswith(PURE) and relative_path(path) != COMPILER:
-        assert not {name.split(".")[0] for name in imports(path)} & {"pathlib", "pydantic", "os", "io"}
+def test_pure_modules_take_no_paths_and_no_params():
+    for path in sources("reffusion"):
+        if relative_path(path).removeprefix("reffusion/").startswith(PURE) and relative_path(path) != COMPILER:
+            assert not {name.split(".")[0] for name in imports(path)} & {"pathlib", "pydantic", "os", "io"}, path
 
 
 def test_the_benchmark_sets_one_thread_before_numpy_and_torch_are_loaded():

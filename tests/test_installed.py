@@ -14,7 +14,6 @@ from scenes.capture import write_four_photos
 from scenes.processes import run_module
 
 from runner.keys import Hashes, code_fingerprints
-from runner.pipeline import load_pipeline
 
 pytestmark = pytest.mark.integration
 
@@ -77,7 +76,7 @@ def test_stages_depend_on_the_same_code(wheel_folder, tmp_path):
     An installed version thus reuses the results of a checkout, and repeats only stages whose code differs.
     """
     app, hashes = wheel_folder / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
-    for stage in load_pipeline(ROOT).stages:
+    for stage in ("poses", "distill"):
         for folder in ("stages", "stages/plan"):
             code = code_fingerprints(ROOT, stage, hashes, folder)
             assert f"reffusion/params/{stage}.py" in code

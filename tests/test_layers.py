@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 from scenes.cameras import make_camera
 
-from reffusion.background.continuation import _enclosed_patches
 from reffusion.depth.background_depth import CompletionSettings, Hints, ViewDepth, continue_depth
 from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import alpha_expansion, potts_cost
@@ -177,16 +176,3 @@ def test_each_gap_continues_the_farthest_surface_that_it_touches():
     assert "the farthest of" in message
     np.testing.assert_allclose(found[within], 1.0, rtol=1e-3)
     np.testing.assert_allclose(found[beside], (0.3 + 0.001 * columns)[beside], rtol=1e-3)
-
-
-def test_a_mirror_is_surrounded_and_a_recess_is_not():
-    """A patch inside known surfaces is enclosed, although a part of its border is hidden.
-
-    A recess is not enclosed: known surfaces border it on two sides only, as beside the corner of an L-shaped room.
-    """
-    rows, columns = np.mgrid[:100, :100]
-    round_plate = np.hypot(rows - 50, columns - 50) < 20
-    hidden = (rows > 60) & (columns < 40)
-    assert _enclosed_patches(~round_plate & ~hidden, round_plate).sum() > 0.95 * round_plate.sum()
-    recess = (columns < 50) & (columns > 10) & (rows > 20) & (rows < 80)
-    assert not _enclosed_patches((columns >= 50) | (rows >= 80), recess).any()

@@ -245,17 +245,6 @@ def test_unseen_gaussians_stay_and_late_ones_start_afresh():
     assert torch.allclose(first, -Rates().means * sign[3:], rtol=1e-2)
 
 
-def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
-    optimizer = GaussianOptimizer(gaussians_near_origin(5))
-    set_random_gradients(optimizer, 0)
-    optimizer.gaussians.opacity_logits.grad[2] = float("nan")
-    before = optimizer.state_dict()
-    with pytest.raises(FloatingPointError, match="opacity_logits"):
-        optimizer.step(0.0)
-    after = optimizer.state_dict()
-    assert all(torch.equal(before["parameters"][n], after["parameters"][n]) for n in PARAMETERS)
-
-
 def test_state_continues_bit_for_bit():
     unbroken = GaussianOptimizer(gaussians_near_origin(9), masked=torch.arange(9) % 2 == 0)
     for i in range(3):

@@ -33,15 +33,12 @@ def pictures():
     return pixels[named], masks[named], [captions[index] for index in named], wrong
 
 
-@pytest.mark.xfail(reason="a whole view and a crop look too alike to these weights: see the model card", strict=True)
 def test_the_papers_two_prompts_change_the_prediction(pictures):
-    """The change is at least 1 % of the rms of the prediction, in the mean over the noise levels."""
-    assert measure_change_by_prompts(pictures) > 0.01
+    """A text encoder that has collapsed changed predictions by 1e-6 of their rms.
 
-
-def test_a_collapsed_text_encoder_would_be_noticed(pictures):
-    """The weights before changed their predictions by 1e-6."""
-    assert measure_change_by_prompts(pictures) > 0.003
+    Of 1 % and more, the model card would have to say that a whole view and a crop no longer look too alike.
+    """
+    assert 0.003 < measure_change_by_prompts(pictures) < 0.01
 
 
 def measure_change_by_prompts(pictures) -> float:
@@ -60,6 +57,7 @@ def measure_change_by_prompts(pictures) -> float:
     return float((whole - crop).square().mean().sqrt() / whole.square().mean().sqrt())
 
 
+@pytest.mark.slow
 def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):
     pixels, masks, right, wrong = pictures
     assert len(right) == SAMPLES and (masks.mean((1, 2, 3)) > 0.65).float().mean() > 0.25

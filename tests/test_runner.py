@@ -173,7 +173,7 @@ def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(proje
 
 def preview(""",
     )
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert set(statuses(project).values()) == {"cached"}
     write_files(project, {"data/toy/notes/idea.txt": "?"})
@@ -192,10 +192,10 @@ def scene_facts(params, scene):
 
 def preview(""",
     )
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert statuses(project)["poses"] == "run the scene's drafts changed"
-    run_project(capsys, project)
+    run_project(capsys, project, "poses")
     write_files(project, {"data/toy/drafts/idea.txt": "!"})
     assert set(statuses(project).values()) == {"cached"}
 
@@ -252,14 +252,14 @@ def test_exported_files_outlive_their_artifact(project, capsys):
     invent = """,
     )
     read_drafts = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
-    run_project(capsys, project, set="masks.threshold=102")
+    run_project(capsys, project, "masks", set="masks.threshold=102")
     assert read_drafts() == {"a": "102", "b": "102"}
     (project / "runs/toy/drafts/a").write_text("drawn")
     (project / "runs/toy/drafts/mine").write_text("too")
     run_scene(make_request(project, set="masks.threshold=103"), "masks")
     assert read_drafts() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
     assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
-    run_project(capsys, project, set="masks.threshold=101")
+    run_project(capsys, project, "masks", set="masks.threshold=101")
     assert read_drafts() == {"a": "drawn", "mine": "too"}
 
 
@@ -726,7 +726,7 @@ def test_groups_merge_layer_over_layer(empty_project):
 
 def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(empty_project, capsys):
     write_files(empty_project, NESTING)
-    run_project(capsys, empty_project)
+    run_project(capsys, empty_project, "distill")
     states = statuses(empty_project, set="distill.sds.lora.rank=9 distill.sds.weight=3")
     assert states["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
     assert statuses(empty_project, set="distill.sds.weight=0")["distill"] == "skip no gain"
@@ -766,8 +766,8 @@ def test_the_layer_that_asked_last_is_named(empty_project):
 
 def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(empty_project, capsys):
     write_files(empty_project, NESTING)
-    run_project(capsys, empty_project)
-    assert set(statuses(empty_project, set="distill.checkpoint_seconds=5").values()) == {"cached"}
+    run_project(capsys, empty_project, "distill")
+    assert statuses(empty_project, set="distill.checkpoint_seconds=5")["distill"] == "cached"
     receipt = json.loads((empty_project / "runs/toy/distill/receipt.json").read_text())
     assert receipt["params"]["checkpoint_seconds"] == 60.0 and receipt["unkeyed"] == ["checkpoint_seconds"]
 

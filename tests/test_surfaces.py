@@ -179,6 +179,8 @@ def test_points_inside_a_plane_differ_from_points_beyond_it():
     assert (continuation._enclosed_patches(seen, free) == (away < 20)).all(), (
         "a plate in a table, no speck, nor the garden"
     )
+    hidden = (rows > 10) & (columns < -10)
+    assert continuation._enclosed_patches(seen & ~hidden, away < 20).sum() > 0.95 * (away < 20).sum(), "partly hidden"
     open_to_a_side = seen & ~((np.abs(rows) < 6) & (columns > 0))
     assert not continuation._enclosed_patches(open_to_a_side, free | ~open_to_a_side).any()
 

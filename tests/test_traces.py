@@ -16,12 +16,9 @@ from lab.bench import gate
 from lab.bench.points import Diagram, Point, recommendation
 from reffusion import trace
 from reffusion.depth.background_depth import CompletionSettings
-from reffusion.distill import loop as distilling
-from reffusion.fit import reconstruction as fitting
 from reffusion.initialize import fill
 from reffusion.io.ply import load_ply
 from reffusion.io.traces import MAIN, load_trace
-from reffusion.prior import personalize as personalizing
 from reffusion.types import PARAMETERS
 from runner import Refused
 from runner.parameters import parse_duration, split_budget, stack_layers
@@ -165,13 +162,6 @@ def test_moments_depend_on_the_iteration_only():
     assert [i for i in range(41) if trace.is_log_step(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
 
 
-KILLED = {
-    "fit": (fitting, "step", 6),
-    "personalize": (personalizing, "train_step", 4),
-    "distill": (distilling, "take_step", 1),
-}
-
-
 @pytest.mark.parametrize(("saving", "every"), [(3.0, 10.0), (0.01, 10.0), (30.0, 0.1)])
 def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every):
     """A step takes 0.5 s and a checkpoint `saving` s. The first checkpoint, whose cost is unknown, does not count."""
@@ -210,29 +200,6 @@ def test_a_slow_disk_does_not_hold_a_stage_up(initialized_folders, tmp_path, mon
     monkeypatch.setattr(trace, "save_checkpoint", slowly)
     run_stage(stage, initialized_folders, tmp_path, checkpoint_seconds=1e-9)
     assert len(saved) == 1
-
-
-@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=pytest.mark.slow), "distill"])
-def test_a_stage_gives_the_same_after_a_kill(initialized_folders, tmp_path, monkeypatch, stage):
-    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
-    module, name, position = KILLED[stage]
-    often = {"checkpoint_seconds": 1e-9}
-    whole = run_stage(stage, initialized_folders, tmp_path / "whole", **often)
-    real, moment = getattr(module, name), trace_lines(whole)[-1]["iteration"] // 2
-
-    def killing(*arguments):
-        if arguments[position] == moment:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(module, name, killing)
-    with pytest.raises(KeyboardInterrupt):
-        run_stage(stage, initialized_folders, tmp_path / "broken", **often)
-    assert (tmp_path / "broken" / trace.CHECKPOINT).exists()
-    monkeypatch.setattr(module, name, real)
-    broken = run_stage(stage, initialized_folders, tmp_path / "broken", **often)
-    assert has_same_result(broken, whole)
-    assert not (broken / trace.CHECKPOINT).exists()
 
 
 # ---------------------------------------------------------------------------------------------------- time budgets

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from scenes.capture import make_truth
 from scenes.capture import write_capture as write_capture
 from scenes.distill_scene import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
 from scenes.networks import save_small_prior
+from scenes.planned_runs import decide_stages, pretend_to_run
 from scenes.settings import with_changes
 from scenes.stage_runs import run_through_masks
 
@@ -32,10 +32,9 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.params.distill import LiftTerm
 from reffusion.types import PARAMETERS, Reference
-from runner.artifacts import hash_contents
+from runner.keys import Hashes
 from runner.pipeline import load_pipeline
-from runner.plan import Decision, decide
-from runner.resolve import Request, ResolvedJob, resolve
+from runner.resolve import Request, resolve
 from stages import distill, evaluate, finish, fit, initialize, lift
 from stages.plan import fit as plan_fit
 
@@ -72,32 +71,20 @@ PLANS = {
 WITH_SDS = "distill.sds.run=always"
 
 
-def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
-    decisions: dict[str, Decision] = {}
-    for stage in job.pipeline.stages:
-        decisions[stage] = decide(job, stage, decisions)
-    return decisions
-
-
 @pytest.fixture(scope="module")
-def finished_capture(tmp_path_factory):
-    """A small scene, and the folder runs/ after the scene's own run, with the files that the runner reads."""
+def resolve_finished(stages_answer_here, tmp_path_factory):
+    """A function that resolves requests, by profile and variant, for a small scene after its own run.
+
+    The folder runs/ has the files that the runner reads. Code is read once for all requests.
+    """
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
-    job, decisions = resolve(Request(ROOT, runs, str(scene), profile="laptop", set=WITH_SDS)), {}
-    for stage in job.pipeline.stages:
-        decisions[stage] = decide(job, stage, decisions)
-        if decisions[stage].status == "run":
-            place = runs / "scene" / stage
-            (place / "masks").mkdir(parents=True)
-            (place / "masks" / "v00.png").write_text(stage)
-            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7}))
-            inputs = decisions[stage].inputs
-            receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
-            (place / "receipt.json").write_text(json.dumps(receipt))
-            decisions[stage] = decide(job, stage, decisions)
+    hashes = Hashes(runs / "hashes")
+    resolve_one = lambda profile="laptop", **how: resolve(Request(ROOT, runs, str(scene), profile, **how), hashes)
+    job = resolve_one(set=WITH_SDS)
+    decisions = pretend_to_run(job, job.pipeline.stages)
     assert [s for s, d in decisions.items() if d.status != "cached"] == ["lift"]
-    return scene, runs
+    return resolve_one
 
 
 def test_every_variant_has_a_plan_here():
@@ -108,10 +95,9 @@ def test_every_variant_has_a_plan_here():
 
 
 @pytest.mark.parametrize("variant", PLANS)
-def test_a_variant_runs_what_it_changes_and_shares_the_rest(finished_capture, variant):
-    scene, runs = finished_capture
-    request = Request(ROOT, runs, str(scene), profile="laptop", variant=variant, set=WITH_SDS)
-    decisions = decide_stages(resolve(request))
+def test_a_variant_runs_what_it_changes_and_shares_the_rest(resolve_finished, variant):
+    job = resolve_finished(variant=variant, set=WITH_SDS)
+    decisions = decide_stages(job, job.pipeline.stages)
     runs_here, left_out = PLANS[variant]
     assert {s for s, d in decisions.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
     assert {s for s, d in decisions.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
@@ -120,18 +106,14 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(finished_capture, va
     assert all(decisions[s].reason == "shared with scene" for s in shared)
 
 
-def test_with_the_papers_terms_every_ablation_leaves_something_out(tmp_path):
-    scene = write_capture(tmp_path / "scene", "llff", make_truth())
-    request = Request(ROOT, tmp_path / "runs", str(scene), profile="paper-terms")
-    full = resolve(request).params
-    same = [name for name in PLANS if name.startswith("no_") and resolve(replace(request, variant=name)).params == full]
-    assert not same
+def test_with_the_papers_terms_every_ablation_leaves_something_out(resolve_finished):
+    full = resolve_finished("paper-terms").params
+    for name in PLANS:
+        assert not name.startswith("no_") or resolve_finished("paper-terms", variant=name).params != full, name
 
 
-def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
-    scene, runs = write_capture(tmp_path / "scene", "llff", make_truth()), tmp_path / "runs"
-    terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
-    laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
+def test_the_papers_terms_are_the_papers_at_the_laptops_size(resolve_finished):
+    terms, laptop = resolve_finished("paper-terms").params, resolve_finished().params
     size = {"prior", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
     # values that the paper leaves open
     chosen = {"iterations", "repaint", "sds.t_high_last", "sds.guidance"}
@@ -144,7 +126,7 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     assert all(ours[name] == theirs[name] for name in size)
     changed = {stage for stage in terms if terms[stage] != laptop[stage]}
     assert changed == {"masks", "personalize", "initialize", "distill"}
-    start = resolve(Request(ROOT, runs, str(scene), profile="paper")).params["initialize"]
+    start = resolve_finished("paper").params["initialize"]
     assert {name for name in start if start[name] != terms["initialize"][name]} == {"depth", "device"}
 
 
@@ -155,12 +137,8 @@ def by_dotted_name(params):
     return {name: value for name, value in params.items() if name not in groups} | inner
 
 
-def test_the_papers_profile_takes_every_variant(finished_capture):
-    scene, runs = finished_capture
-    requests = [
-        Request(ROOT, runs, str(scene), profile="paper", variant=v) for v in ("lift_perceptual_diffusion", "sds_plain")
-    ]
-    lifted, plain = (resolve(request).params for request in requests)
+def test_the_papers_profile_takes_every_variant(resolve_finished):
+    lifted, plain = (resolve_finished("paper", variant=v).params for v in ("lift_perceptual_diffusion", "sds_plain"))
     assert (lifted["lift"]["guidance"], lifted["lift"]["prompt"]) == (4, "A photo of a scene")
     assert "sks" not in str(plain["distill"]["prompts"]), "an unadapted prior knows sks as a rifle"
 
@@ -380,7 +358,7 @@ def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monk
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
     for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
         without = {"sds": OFF, "adversarial": OFF, "depth": OFF}
-        params = distill.Params(iterations=4, lift={"weight": 1, "loss": loss}, **without)
+        params = distill.Params(iterations=2, lift={"weight": 1, "loss": loss}, **without)
         out = tmp_path / loss
         out.mkdir()
         distill.run(params, out, **chain, lift=lifted_views)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,3 +155,16 @@ def assert_masked_views(out: Path, views: Iterable[str], share: float = SHARE) -
     assert masked_views(out) == views, masked_views(out)
     shares = [masked_share(out, view) for view in views]
     assert shares == pytest.approx([share] * len(views), abs=1e-3), shares
+
+
+def change_transforms(folder: Path, change: Callable[[dict], object]) -> None:
+    """Change transforms.json; `change` gets its content and changes it in place."""
+    record = json.loads((folder / "transforms.json").read_text())
+    change(record)
+    (folder / "transforms.json").write_text(json.dumps(record))
+
+
+def set_in_frames(folder: Path, key: str, value_of: Callable[[str], object]) -> None:
+    """Set `key` in each frame of transforms.json to `value_of` of its view's name."""
+    set_one = lambda frame: frame.update({key: value_of(Path(frame["file_path"]).stem)})
+    change_transforms(folder, lambda record: [set_one(frame) for frame in record["frames"]])
