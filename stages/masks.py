@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reffusion import morphology
 from reffusion.background.model import surfaces_to_arrays
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.scene_masks import masks_from_clicks, refine_masks
@@ -180,9 +181,9 @@ def collect_raw_masks(
     """Return the raw masks of the views, as a dict view name -> bool [H, W], True = the object.
 
     They are the masks that the scene brings for training views, united over the objects to remove (`params.remove`;
-    None: all). If `params.refine`, the segmentation network redraws them and makes masks for the other training views
-    that show the object. Clicks, if there are any, give masks to the views without one, test views included. The dict
-    is empty if the scene has neither masks nor clicks.
+    None: all), and enlarged by `params.grow`. If `params.refine`, the segmentation network redraws them and makes masks
+    for the other training views that show the object. Clicks, if there are any, give masks to the views without one,
+    test views included. The dict is empty if the scene has neither masks nor clicks.
 
     Args:
         poses, raw_masks: folders of the stages of these names.
@@ -191,6 +192,7 @@ def collect_raw_masks(
         ValueError: several objects have masks of their own, and no view has a mask of each.
     """
     raw = load_raw_masks(raw_masks, scene.train, params.remove)
+    raw = {name: morphology.dilate(mask, params.grow) for name, mask in raw.items()}
     if list_objects(raw_masks) and not raw:
         raise ValueError(
             f"{raw_masks / 'masks'}: no view has a mask of each object; add empty ones where one is unseen"

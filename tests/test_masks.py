@@ -139,6 +139,15 @@ def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
     assert not sets["a0"].raw.any()
 
 
+def test_masks_without_the_objects_rim_are_enlarged(tmp_path):
+    whole = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN}
+    small = {name: ~morphology.dilate(~mask, 0.03) for name, mask in whole.items()}
+    for grow, found in ((0.0, False), (0.03, True)):
+        (folder := tmp_path / str(grow)).mkdir()
+        sets, _, _, _ = classify(folder, NEAR, Params(grow=grow), masks=small)
+        assert (wall_scene.iou(sets["a0"].raw, whole["a0"]) > 0.95) == found
+
+
 def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, monkeypatch):
     """All masks miss the same spot of the object, as a segmentation misses a bright reflection.
 

@@ -15,6 +15,12 @@ class Params(Settings):
         None, min_length=1, description="objects to remove, each a folder of masks (masks/<object>/); None: all"
     )
     clicks: Clicked | None = Field(None, description="view -> clicks, from which masks are made if none are given")
+    grow: float = Field(
+        0.0,
+        ge=0,
+        le=0.1,
+        description="share of the image's width by which given masks that leave out a rim are enlarged",
+    )
     refine: bool = Field(
         False,
         description="draw the given masks anew by the segmentation network: for rough ones, up to 2 % of the image's "
