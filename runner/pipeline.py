@@ -29,7 +29,7 @@ class Strict(BaseModel, extra="forbid", frozen=True):
 
 
 class ByParameters(Strict):
-    """What pipeline.yaml says for certain values of parameters only.
+    """A part of pipeline.yaml that applies only while parameters have certain values.
 
     Attributes:
         param: <stage>.<name>, or several such names, of any stages; these parameters must equal `equals`.

@@ -133,9 +133,9 @@ def find_lens(
         hidden: bool [H, W], the object's pixels.
 
     Returns:
-        The lens of the picture; both results of `undistort_reference` for it; and its registration, which is the
-        better one. If both are equally good, paintings count as made over the undistorted photograph, other pictures
-        as made over the photograph.
+        The lens of the picture, both results of `undistort_reference` for this lens, and the registration. The lens is
+        the one whose registration has more inliers. If the two are equal, it is the pinhole for a painting, and the
+        lens of the photograph for any other picture.
     """
     pinhole = undistorted_pinhole(lens)
     lenses = [lens] if pinhole == lens.pinhole else [pinhole, lens] if file.painted else [lens, pinhole]
