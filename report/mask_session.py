@@ -1,7 +1,7 @@
 """State of the mask page: the user's marks, the masks computed from the marks, and the files to which both are saved.
 
 A *mark* is a click, a box or a brush stroke in one view, on the object or on the background. A *given* mask is one that
-the user put into the scene's folder; the page never changes it.
+the user put into the scene's folder; the page never changes it. Strokes may also mark pixels that their view ignores.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import numpy as np
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
+from reffusion.capture.mask_files import ALL_VIEWS, IGNORE, NONE
+from reffusion.capture.roles import Roles
 from reffusion.capture.scene_folder import read_scene
 from reffusion.capture.undistort import load_undistorted_mask
 from reffusion.clicks.color_evidence import sample_evenly
 from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import MAX_NETWORK_VIEWS, FittedViews
-from reffusion.clicks.marks import SIZES, Mark
+from reffusion.clicks.marks import OBJECT, OTHER, SIZES, Mark, confirmed_pixels
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
 from reffusion.clicks.scene_segmentation import (
     SavedMasks,
@@ -38,8 +40,8 @@ from reffusion.clicks.single_view import ViewEvidence
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import WHITE
-from reffusion.io.images import replace_image, to_uint8
+from reffusion.io.given_masks import WHITE, load_given_mask
+from reffusion.io.images import ENDINGS, replace_image, to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_views
 from reffusion.params.clicks import CLICKS
@@ -61,6 +63,7 @@ class Capture:
         fit: folder of the stage `fit`; may not exist yet.
         given: view -> bool [H, W], True on the object: the masks that the page did not write.
         saved: view -> bool [H, W], the masks that the page wrote, undistorted.
+        ignore: view -> file, perhaps missing, with the pixels that only this view ignores; see `find_ignore_files`.
     """
 
     folder: Path
@@ -69,6 +72,7 @@ class Capture:
     fit: Path
     given: dict[str, np.ndarray]
     saved: dict[str, np.ndarray] = field(default_factory=dict)
+    ignore: dict[str, Path] = field(default_factory=dict)
 
 
 def load_capture(home: Path) -> Capture:
@@ -99,7 +103,26 @@ def load_capture(home: Path) -> Capture:
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
     given, lenses = load_raw_masks(raw_masks, [name for name in files if name not in own]), load_lenses(poses)[0]
     saved = {name: load_undistorted_mask(files[name], lenses[name]) for name in sorted(own & lenses.keys())}
-    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), given, saved)
+    ignore = find_ignore_files(folder, params.ignore, roles)
+    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), given, saved, ignore)
+
+
+def find_ignore_files(folder: Path, name: str | None, roles: Roles) -> dict[str, Path]:
+    """Return training view -> picture of the pixels that only this view ignores, which need not exist.
+
+    Args:
+        folder: folder of the scene.
+        name: the key `ignore` of scene.yaml.
+
+    Returns:
+        The files; {} if the scene ignores nothing by `ignore: none`, or has masks of ignored pixels that are no
+        pictures, beside which pictures would not be read or would be second masks.
+    """
+    files = [path for paths in roles.ignore.values() for path in paths]
+    if (name or "").lower() == NONE or any(path.suffix.lower() not in ENDINGS or not path.is_file() for path in files):
+        return {}
+    own = {view: paths[-1] for view, paths in roles.ignore.items() if paths[-1].stem != ALL_VIEWS}
+    return {view: own.get(view, folder / (name or IGNORE) / f"{view}.png") for view in roles.train}
 
 
 def file_digest(path: Path) -> str:
@@ -153,6 +176,7 @@ class Session:
         self.masks: Masks = capture.saved | capture.given
         self.solved_masks = self.masks  # the masks before the marks that are not yet solved
         self.versions = dict.fromkeys(self.views, 0)
+        self.edition = 0  # grows whenever marks, or files of ignored pixels, change
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
         # `revision` grows with each change of the marks. The current masks belong to `solved_revision`.
@@ -169,7 +193,8 @@ class Session:
                 self.events.append(self._from_photograph(saved))
         complete = {*self.views} <= {*self.masks}
         self.settled = SavedMasks(self.events, self.masks) if self.events and complete else None
-        self.saved = self._keys(), complete  # the marks of the saved masks; whether these are the masks of all views
+        # the marks of the saved masks; whether these are the masks of all views
+        self.saved = _keys(self.events), complete
         threading.Thread(target=self._update_masks, daemon=True).start()
         if segmenter is not None:
             threading.Thread(target=self._encode_all, daemon=True).start()
@@ -179,9 +204,16 @@ class Session:
         """Whether marks have changed since the last save, or all views have masks now that were not all saved."""
         with self.lock:
             keys, complete = self.saved
-            return keys != self._keys() or bool(keys and not complete and {*self.views} <= {*self.masks})
+            return keys != _keys(self.events) or bool(keys and not complete and {*self.views} <= {*self.masks})
 
-    def mark(self, name: str, points: Sequence[tuple[float, float]], positive: bool, radius: float = 0.0) -> None:
+    def mark(
+        self,
+        name: str,
+        points: Sequence[tuple[float, float]],
+        positive: bool,
+        radius: float = 0.0,
+        ignores: bool = False,
+    ) -> None:
         """Add a click, a box or a brush stroke.
 
         Args:
@@ -190,23 +222,30 @@ class Session:
                 path of a stroke.
             positive: True = on the object, False = on the background.
             radius: radius of the brush, px; 0 for a click and a box.
+            ignores: True for a stroke over pixels that this view ignores (`positive`) or does not ignore.
 
         Raises:
             ValueError: the view is unknown or has a given mask, there is no point or one lies outside the view, there
-                are more than two points without a radius, or the radius is negative or larger than the view.
+                are more than two points without a radius, the radius is negative or larger than the view, or pixels
+                are ignored without a radius or in a view that takes no file of them (`Capture.ignore`).
         """
         if name not in self.images:
             raise ValueError(f"there is no view '{name}'")
-        if name in self.capture.given:
+        if ignores and name not in self.capture.ignore:
+            folder = self.capture.folder
+            raise ValueError(f"{folder}: `ignore: none` is set, or its masks of ignored pixels are no pictures")
+        if name in self.capture.given and not ignores:
             raise ValueError(f"{name} has a mask of your own; move it out of {self.capture.masks} to mark here")
         height, width = self.images[name].shape[:2]
         if not points or any(not (0 <= x <= width and 0 <= y <= height) for x, y in points):
             raise ValueError(f"a mark lies outside {name}, which has {width}x{height} px")
+        if ignores and not radius:
+            raise ValueError("pixels are ignored below the brush only, and this mark has none")
         if not radius and len(points) > 2:
             raise ValueError(f"a mark of {len(points)} points in {name} has no brush; a click has 1 point, a box has 2")
         if not 0 <= radius <= max(height, width):
             raise ValueError(f"a brush of {radius:g} px on a view of {width}x{height} px")
-        event = Event(name, Mark(np.array(points, float), positive, radius), is_early=self.gaussians is None)
+        event = Event(name, Mark(np.array(points, float), positive, radius), self.gaussians is None, ignores)
         self._change(lambda events: [*events, event])
 
     def remove(self, index: int) -> None:
@@ -258,17 +297,19 @@ class Session:
             return changed[-1].view if changed else ""
 
     def save(self) -> dict[str, int]:
-        """Wait for the masks of the latest marks, then write all masks, and the marks to clicks.json.
+        """Wait for the masks of the latest marks, then write all masks, the marks to clicks.json, and ignored pixels.
 
         Masks are written in the pixels of the original, distorted photographs. The masks of an earlier call are
-        overwritten, or deleted if the view had marks then and has no mask any more.
+        overwritten, or deleted if the view had marks then and has no mask any more. The files of ignored pixels are
+        changed by the strokes, which are then no longer marks: only the eraser takes them back.
 
         Returns:
-            {"written": number of masks written, "kept": number of given masks, which stay as they are}.
+            {"written": number of masks written, "kept": number of given masks, which stay as they are, "ignored":
+            number of files of ignored pixels that were changed}.
 
         Raises:
-            ValueError: there is no mask to write, the masks could not be computed, or a file that the page did not
-                write has the name of a mask to write.
+            ValueError: there is nothing to write, the masks could not be computed, a file that the page did not write
+                has the name of a mask to write, or a view would be ignored completely.
         """
         with self.lock:
             self.lock.wait_for(lambda: self.solved_revision == self.revision)
@@ -276,45 +317,90 @@ class Session:
                 raise ValueError(self.error)
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
+                masks = {}
+            if not masks and not any(event.ignores for event in self.events):
                 raise ValueError("nothing to save yet: click on the object first")
-            folder, saved = self.capture.folder, _saved_marks(self.capture.folder)
-            written = dict(saved["written"])
-            paths = {name: self.capture.masks / f"{name}.png" for name in masks}
-            foreign = [
-                p for p in paths.values() if p.exists() and written.get(_relative_path(p, folder)) != file_digest(p)
-            ]
-            if foreign:
-                raise ValueError(f"{foreign[0]}: not written by this page, so it is not overwritten; move it away")
-            for name, path in paths.items():
-                replace_image(path, to_uint8(distort_mask(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
-                written[_relative_path(path, folder)] = file_digest(path)
-            cleared = {mark["view"] for mark in saved["marks"]}.intersection(self.views) - {*self.masks}
-            for path in (self.capture.masks / f"{name}.png" for name in cleared):
-                if path.exists() and written.get(_relative_path(path, folder)) == file_digest(path):
-                    path.unlink()
-                    del written[_relative_path(path, folder)]
-            save_json(
-                folder / CLICKS, {"marks": [self._to_photograph(each) for each in self.events], "written": written}
+            ignored = self._save_ignored()
+            if masks:
+                self._save_masks(masks)
+            return {"written": len(masks), "kept": len(self.capture.given), "ignored": ignored}
+
+    def _save_masks(self, masks: Masks) -> None:
+        """Write masks, and the marks on the object to clicks.json; see `save`."""
+        folder, saved = self.capture.folder, _saved_marks(self.capture.folder)
+        written = dict(saved["written"])
+        paths = {name: self.capture.masks / f"{name}.png" for name in masks}
+        foreign = [p for p in paths.values() if p.exists() and written.get(_relative_path(p, folder)) != file_digest(p)]
+        if foreign:
+            raise ValueError(f"{foreign[0]}: not written by this page, so it is not overwritten; move it away")
+        for name, path in paths.items():
+            replace_image(path, to_uint8(distort_mask(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
+            written[_relative_path(path, folder)] = file_digest(path)
+        cleared = {mark["view"] for mark in saved["marks"]}.intersection(self.views) - {*self.masks}
+        for path in (self.capture.masks / f"{name}.png" for name in cleared):
+            if path.exists() and written.get(_relative_path(path, folder)) == file_digest(path):
+                path.unlink()
+                del written[_relative_path(path, folder)]
+        save_json(folder / CLICKS, {"marks": [self._to_photograph(each) for each in self.events], "written": written})
+        self.saved = _keys(self.events), {*self.views} <= {*self.masks}
+
+    def _save_ignored(self) -> int:
+        """Change the files of ignored pixels by the strokes, forget the strokes, and return the number of files."""
+        views = dict.fromkeys(event.view for event in self.events if event.ignores)
+        changed = {name: self.ignored_pixels(name, in_photograph=True) for name in views}
+        if whole := [name for name, pixels in changed.items() if pixels.all()]:
+            raise ValueError(
+                f"all of {whole[0]} would be ignored; erase a part, or leave the view out: `exclude: [{whole[0]}]`"
             )
-            self.saved = self._keys(), {*self.views} <= {*self.masks}
-            return {"written": len(masks), "kept": len(self.capture.given)}
+        for name, pixels in changed.items():
+            # An empty picture is written too, because a folder `ignore` without pictures is refused.
+            replace_image(self.capture.ignore[name], to_uint8(pixels * 1.0))
+        if changed:
+            self.events, self.history = [event for event in self.events if not event.ignores], []
+            self.edition += 1
+        return len(changed)
+
+    def ignored_pixels(self, name: str, in_photograph: bool = False) -> np.ndarray:
+        """Return which pixels only this view ignores: those of its file, changed by the strokes since the last save.
+
+        Args:
+            name: name of a view in `Capture.ignore`.
+            in_photograph: True for the pixels of the distorted photograph, False for those of the undistorted view.
+
+        Returns:
+            bool [H, W].
+        """
+        path, lens, size = self.capture.ignore[name], self.lenses[name], self.sizes[name]
+        marks = [event.mark for event in self.events if event.ignores and event.view == name]
+        signs = confirmed_pixels(marks, (lens.height, lens.width))
+        more, less = signs == OBJECT, signs == OTHER
+        if in_photograph:
+            more, less = (distort_mask(each, lens, size) for each in (more, less))
+        if not path.is_file():
+            return more
+        before = load_given_mask(path, size[::-1]) if in_photograph else load_undistorted_mask(path, lens)
+        return before & ~less | more
 
     def state(self) -> dict:
         """Return the state that the page shows, as plain JSON values.
 
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
-            when the mask changes; None without a mask) and "given" (True if the mask is given); "first_view": the view
-            in which the object is probably easy to mark; "fit": True once the fit is loaded; "loading": True if there
-            is a fit that is not loaded yet; "can_undo": True if there is something to undo; "busy": True while the
-            masks do not yet follow the latest marks; "progress": share of this computation that is done; "changes":
-            views whose masks the last mark changed, as pairs of name and share of the mask's pixels, the most changed
-            first; "error": reason why the masks could not be computed, or ""; "unsaved": as the property; "folder":
-            folder of the masks; "network": name of the segmentation network, or "". A mark has "index" (for `remove`),
-            "points", "sign" ("+" on the object, "-" on the background), "radius", "size" and "effect" (share of its
-            picture's pixels that the mark changed; None if that is not known).
+            when the mask changes; None without a mask), "given" (True if the mask is given) and "ignored" (a number
+            that grows when the ignored pixels change; None without a file or a stroke); "first_view": the view in which
+            the object is probably easy to mark; "fit": True once the fit is loaded; "loading": True if there is a fit
+            that is not loaded yet; "can_undo": True if there is something to undo; "busy": True while the masks do not
+            yet follow the latest marks; "progress": share of this computation that is done; "changes": views whose
+            masks the last mark changed, as pairs of name and share of the mask's pixels, the most changed first;
+            "error": reason why the masks could not be computed, or ""; "unsaved": as the property; "folder": folder of
+            the masks; "network": name of the segmentation network, or "". A mark has "index" (for `remove`), "points",
+            "sign" ("+" on the object, "-" on the background), "radius", "size", "ignores" (True if it marks ignored
+            pixels instead of the object) and "effect" (share of its picture's pixels that the mark changed; None if
+            that is not known).
         """
         with self.lock:
+            ignoring = {name for name, path in self.capture.ignore.items() if path.is_file()}
+            ignoring |= {event.view for event in self.events if event.ignores}
             views = [
                 {
                     "name": name,
@@ -327,6 +413,7 @@ class Session:
                             "sign": "+" if event.mark.positive else "-",
                             "radius": event.mark.radius,
                             "size": event.mark.size,
+                            "ignores": event.ignores,
                             "effect": self.effects.get(event.key),
                         }
                         for k, event in enumerate(self.events)
@@ -334,6 +421,7 @@ class Session:
                     ],
                     "mask": self.versions[name] if name in self.masks else None,
                     "given": name in self.capture.given,
+                    "ignored": self.edition if name in ignoring else None,
                 }
                 for name in self.views
             ]
@@ -359,19 +447,16 @@ class Session:
             self._replace(change(self.events))
 
     def _replace(self, events: list[Event]) -> None:
-        """Replace the marks, and let the background thread compute the masks anew."""
+        """Replace the marks, and let the background thread compute the masks anew if those on the object differ."""
         with self.lock:
-            self.events, self.error = events, ""
-            self.revision += 1
+            if _keys(_on_object(events)) != _keys(_on_object(self.events)):
+                self.revision, self.error = self.revision + 1, ""
+            self.events, self.edition = events, self.edition + 1
             self.lock.notify_all()
-
-    def _keys(self) -> list[Hashable]:
-        """Return a key for each mark, in order; equal keys mean equal marks."""
-        return [event.key for event in self.events]
 
     def _progress(self) -> float:
         """Return the share of the present computation that is done: masks use each view without marks twice."""
-        marked = {event.view for event in self.events}
+        marked = {event.view for event in _on_object(self.events)}
         uses = [min(self.uses[name], 2) / 2 for name in self.views if name not in marked]
         return sum(uses) / max(len(uses), 1)
 
@@ -415,7 +500,7 @@ class Session:
         while True:
             with self.lock:
                 self.lock.wait_for(lambda: self.solved_revision < self.revision, None if self.gaussians else 1.0)
-                revision, events = self.revision, list(self.events)
+                revision, events = self.revision, _on_object(self.events)
             if self.gaussians is None and self.is_fitted():
                 self._load_fit()
                 continue
@@ -442,7 +527,7 @@ class Session:
             self.gaussians = gaussians
             self.evidence_of.cache_clear()  # evidence from before the fit has no surfaces
             self.results.clear()
-            self.revision += bool(self.events)
+            self.revision += bool(_on_object(self.events))
 
     def _solve(self, events: list[Event], revision: int) -> None:
         """Compute the masks from the marks and show them; raises Superseded if the user changes the marks meanwhile."""
@@ -514,6 +599,16 @@ class Session:
                 if masks.get(name) is not self.masks.get(name):
                     self.versions[name] += 1
             self.masks = dict(masks)
+
+
+def _keys(events: Sequence[Event]) -> list[Hashable]:
+    """Return a key for each mark, in order; equal keys mean equal marks."""
+    return [event.key for event in events]
+
+
+def _on_object(events: Sequence[Event]) -> list[Event]:
+    """Return the marks on the object or the background, without the strokes over ignored pixels."""
+    return [event for event in events if not event.ignores]
 
 
 def _compare_masks(before: Masks, after: Masks) -> dict[str, float]:

@@ -19,12 +19,15 @@ from PIL import Image
 from scenes import capture as captures
 from scenes import wall_scene
 from scenes.browser import open_page
-from scenes.images import psnr
+from scenes.capture_checks import write_mask
+from scenes.images import psnr, rectangle_mask
 from scenes.processes import ROOT, wait_until
 from scenes.references import run_reference_stage
 
-from reffusion.io.arrays import save_json, save_text
-from reffusion.io.images import load_image, save_image
+from reffusion.capture.scene_folder import read_scene
+from reffusion.io.arrays import load_json, save_json, save_text
+from reffusion.io.images import load_image, load_mask, save_image
+from reffusion.params.raw_masks import Params
 from report import cli, verdict
 from report.access import REFUSAL, Access
 from report.app import brush, painting, pictures, scenes, uploads
@@ -34,9 +37,12 @@ from report.app.jobs import Jobs, Plan
 from report.app.scenes import OpenScene
 from report.app.server import Server
 from report.job_data import load_job
+from report.mask_session import find_ignore_files
+from stages.plan import poses as poses_plan
 
 pytestmark = pytest.mark.integration
 
+LOWER_ROWS = rectangle_mask((captures.HEIGHT, captures.WIDTH), (60, captures.HEIGHT), (0, captures.WIDTH))
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -116,9 +122,9 @@ def scene(page, tmp_path):
     return open_scene(page, tmp_path / "scene")
 
 
-def open_scene(page, folder):
+def open_scene(page, folder, model=captures.PINHOLE):
     """Write a capture with poses and without masks, and open it; return its folder."""
-    truth = captures.make_truth()
+    truth = captures.make_truth(model)
     captures.write_pictures(folder / "images", sorted(truth.world_to_camera))
     captures.write_model(folder / "sparse/0", truth, ending=".png")
     assert page.post("/scenes", {"path": str(folder)}) == (200, {"name": "scene"})
@@ -356,6 +362,97 @@ def test_a_job_is_started_stopped_and_goes_on(page, scene):
     assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
     wait_until(lambda: page.state()["job"]["stage"] == "fit")
     assert "poses: " not in "\n".join(page.state()["job"]["log"]), "the poses are not found anew"
+
+
+@pytest.fixture
+def ignoring(page, tmp_path, monkeypatch):
+    """The page with a scene whose mask step is open, while no fit runs; v02 ignores its lower rows already."""
+    scene = open_scene(page, tmp_path / "scene", captures.OPENCV)
+    write_mask(scene / "ignore/v02.png", LOWER_ROWS)
+    run_first_stages(page)
+    monkeypatch.setattr(page.app.jobs, "start", lambda *_, **__: None)
+    assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
+    return page
+
+
+def run_first_stages(page):
+    Jobs.start(page.app.jobs, page.app.scenes["scene"], "raw_masks", with_clicks=True)
+    wait_until(lambda: page.state()["job"]["state"] == "finished" and not page.state()["plan"]["busy"])
+
+
+def paint(page, view, sign="+", radius=5.0, ignores=True):
+    stroke = {"view": view, "points": [[30, 20], [60, 20]], "sign": sign, "radius": radius, "ignores": ignores}
+    return page.post("/scenes/scene/mask/mark", stroke)
+
+
+def blue_pixels(page, view):
+    status, picture = page.send("GET", f"/scenes/scene/mask/ignored/{view}")
+    assert status == 200
+    return np.array(Image.open(io.BytesIO(picture)))[..., 3] > 0
+
+
+def ignored_views(page):
+    state = json.loads(page.send("GET", "/scenes/scene/mask/state")[1])
+    return [view["name"] for view in state["views"] if view["ignored"] is not None]
+
+
+def test_strokes_of_the_second_color_are_ignored_in_their_photograph(ignoring, tmp_path):
+    page, folder, placed = ignoring, tmp_path / "scene/ignore", tmp_path / "runs/scene/poses/ignored"
+    assert ignored_views(page) == ["v02"] and "poses" not in page.state()["plan"]["due"]
+    for view in ("v01", "v02"):
+        assert paint(page, view)[0] == 200
+    shown = {view: blue_pixels(page, view) for view in ("v01", "v02")}
+    assert shown["v01"][20, 30:60].all() and 0 < shown["v01"].mean() < 0.1
+    state = json.loads(page.send("GET", "/scenes/scene/mask/state")[1])
+    assert not state["busy"] and not any(view["mask"] for view in state["views"]), "no mask follows"
+    assert page.post("/scenes/scene/mask/save", {}) == (200, {"written": 0, "kept": 0, "ignored": 2})
+    assert sorted(path.name for path in folder.iterdir()) == ["v01.png", "v02.png"]
+    stroke, both = (load_mask(folder / f"{view}.png") for view in ("v01", "v02"))
+    assert stroke.any() and (both == stroke | LOWER_ROWS).all(), "what is there already stays"
+    wait_until(lambda: "poses" in page.state()["plan"]["due"])
+    run_first_stages(page)
+    assert sorted(path.name for path in placed.iterdir()) == ["v01.png", "v02.png"]
+    for view in ("v01", "v02"):
+        found = load_mask(placed / f"{view}.png")
+        assert (found ^ shown[view]).mean() < 0.01 and (found ^ blue_pixels(page, view)).mean() == 0
+
+
+def test_the_eraser_takes_ignored_pixels_back_when_the_page_is_opened_again(ignoring, tmp_path):
+    page, scene = ignoring, tmp_path / "scene"
+    status, answer = paint(page, "v01", radius=0.0)
+    assert status == 400 and "below the brush only" in answer["error"]
+    paint(page, "v01")
+    paint(page, "v00", ignores=False)
+    assert page.post("/scenes/scene/mask/save", {}) == (200, {"written": 1, "kept": 0, "ignored": 1})
+    assert [mark["view"] for mark in load_json(scene / "clicks.json")["marks"]] == ["v00"]
+    page.app.scenes["scene"].mask_step = None
+    assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
+    assert ignored_views(page) == ["v01", "v02"] and blue_pixels(page, "v01")[20, 45]
+    paint(page, "v01", "-", radius=4.0)
+    assert blue_pixels(page, "v01").any() and not blue_pixels(page, "v01")[20, 30:60].any()
+    assert page.post("/scenes/scene/mask/undo", {})[1]["changed"] == "v01" and blue_pixels(page, "v01")[20, 45]
+    for view in ("v01", "v02", "v03"):
+        paint(page, view, "-", radius=9.0)
+    assert page.post("/scenes/scene/mask/save", {})[1]["ignored"] == 3
+    assert not any(load_mask(scene / f"ignore/{view}.png").any() for view in ("v01", "v03"))
+    assert (load_mask(scene / "ignore/v02.png") == LOWER_ROWS).all()
+    assert poses_plan.preview(poses_plan.Params(clicks={}), scene), "the empty pictures are accepted"
+    assert page.post("/scenes/scene/mask/undo", {})[1]["changed"] == "v00", "only the eraser takes back what is saved"
+
+
+def test_ignored_pixels_are_written_where_the_scene_reads_them(tmp_path):
+    truth = captures.make_truth()
+    captures.write_capture(tmp_path, "colmap", truth)
+    views = truth.world_to_camera
+    find = lambda name: find_ignore_files(tmp_path, name, read_scene(Params(ignore=name, clicks={}), tmp_path)[1])
+    assert find(None) == {view: tmp_path / f"ignore/{view}.png" for view in views} and find("none") == {}
+    write_mask(tmp_path / "people/all.png", LOWER_ROWS)
+    write_mask(tmp_path / "people/v02_mask.png", LOWER_ROWS)
+    own = {"v02": tmp_path / "people/v02_mask.png"}
+    assert find("people") == {view: tmp_path / f"people/{view}.png" for view in views} | own
+    (tmp_path / "arrays").mkdir()
+    np.save(tmp_path / "arrays/v02.npy", LOWER_ROWS)
+    assert find("arrays") == {}, "beside pictures, arrays would not be read"
 
 
 def test_a_run_in_a_terminal_is_shown_and_left_alone(still_page, still_scene):

@@ -677,6 +677,24 @@ def test_undo_takes_back_every_change_also_a_removal(clicked_scene, tmp_path):
     assert session.undo() == "a2" and marks() == [] and session.undo() == "" and not session.state()["can_undo"]
 
 
+def test_ignored_pixels_need_a_file_and_leave_a_part_of_their_view(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
+    file, stroke = tmp_path / "ignore/a2.png", [(30.0, 30.0), (60.0, 30.0)]
+    capture = Capture(tmp_path, tmp_path / "masks", placed, fit, {"a2": square_mask("a2")}, {}, {"a2": file})
+    session = Session(capture, lambda: False)
+    with pytest.raises(ValueError, match="`ignore: none` is set"):
+        session.mark("a3", stroke, True, 5.0, ignores=True)
+    with pytest.raises(ValueError, match="a mask of your own"):
+        session.mark("a2", stroke, True, 5.0)
+    session.mark("a2", stroke, True, 96.0, ignores=True)
+    with pytest.raises(ValueError, match="all of a2 would be ignored"):
+        session.save()
+    assert not file.exists()
+    session.mark("a2", stroke, False, 5.0, ignores=True)
+    assert session.save() == {"written": 0, "kept": 1, "ignored": 1} and not session.unsaved
+    assert not load_mask(file)[30, 30:60].any() and load_mask(file)[0, 0]
+
+
 def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
     save_mask(tmp_path / "masks/a3.png", square_mask("a3"))
     before = load_image(tmp_path / "masks/a3.png")

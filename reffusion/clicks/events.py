@@ -22,17 +22,19 @@ class Event:
         mark: the mark, in pixels of the view.
         is_early: True if the mark was made before there were masks of all views. The person then saw only the mask of
             this view, as the view's own marks make it.
+        ignores: True if the mark is a stroke over pixels that its view ignores, and says nothing about the object.
     """
 
     view: str
     mark: Mark
     is_early: bool = False
+    ignores: bool = False
 
     @property
-    def key(self) -> tuple[str, bool, float, str, bytes, bool]:
+    def key(self) -> tuple[str, bool, float, str, bytes, bool, bool]:
         """A hashable key, which is equal for equal events."""
         mark = self.mark
-        return self.view, mark.positive, mark.radius, mark.size, mark.points.tobytes(), self.is_early
+        return self.view, mark.positive, mark.radius, mark.size, mark.points.tobytes(), self.is_early, self.ignores
 
 
 def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[Event]], list[list[Event]]]:

@@ -22,7 +22,7 @@ from report.mask_session import Session
 
 PAGE = Path(__file__).parent.with_name("mask.html")
 THUMBNAIL = 160  # longer side, px
-TINT = (255, 0, 160)
+OBJECT_TINT, IGNORED_TINT = (255, 0, 160), (10, 124, 255)
 ACTIONS = ("mark", "remove", "resize", "clear", "undo", "save")
 
 
@@ -65,7 +65,8 @@ class MaskStep:
             return saved
         if action == "mark":
             points = [(float(x), float(y)) for x, y in request["points"]]
-            session.mark(str(request["view"]), points, request["sign"] == "+", float(request["radius"]))
+            ignores = request.get("ignores") is True
+            session.mark(str(request["view"]), points, request["sign"] == "+", float(request["radius"]), ignores)
         elif action == "undo":
             changed = session.undo()
             return self.state() | {"changed": changed}
@@ -98,7 +99,9 @@ def make_routes(prefix: str, find: Callable[[Request], MaskStep]) -> list[Route]
         if kind in ("photo", "small") and name in session.images:
             return Response(to_jpeg(session.images[name], THUMBNAIL if kind == "small" else 0), media_type="image/jpeg")
         if kind == "mask" and name in session.masks:
-            return Response(draw_mask(session.masks[name]), media_type="image/png")
+            return Response(draw_mask(session.masks[name], OBJECT_TINT), media_type="image/png")
+        if kind == "ignored" and name in session.capture.ignore:
+            return Response(draw_mask(session.ignored_pixels(name), IGNORED_TINT), media_type="image/png")
         raise LookupError("no such picture")
 
     async def change(request: Request) -> Response:
@@ -131,11 +134,11 @@ def to_png(image: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def draw_mask(mask: np.ndarray) -> bytes:
+def draw_mask(mask: np.ndarray, tint: tuple[int, int, int]) -> bytes:
     """Return a mask, bool [H, W], as PNG bytes: translucent inside, with an opaque border, transparent elsewhere."""
     inner = mask.copy()
     inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
     overlay = np.zeros((*mask.shape, 4), np.uint8)
-    overlay[mask] = (*TINT, 110)
-    overlay[mask & ~inner] = (*TINT, 255)
+    overlay[mask] = (*tint, 110)
+    overlay[mask & ~inner] = (*tint, 255)
     return to_png(overlay)
