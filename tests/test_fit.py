@@ -306,6 +306,9 @@ def test_the_start_has_the_points_colors_and_spacing():
     assert torch.allclose(gaussians.log_scales.exp(), torch.tensor(0.1), rtol=1e-5)
     assert torch.allclose(0.5 + 0.28209479 * gaussians.sh[:, 0], torch.tensor([10, 128, 250]) / 255, atol=1e-6)
     assert torch.allclose(gaussians.opacity_logits.sigmoid(), torch.tensor(0.1))
+    opacities = np.linspace(0.1, 0.9, len(grid))
+    each = initial_gaussians(grid, colors, 0, 1000, seeding.generator(0), opacities).opacity_logits.sigmoid()
+    np.testing.assert_allclose(each, opacities, rtol=1e-5)
     assert gaussians.sh.shape == (64, 9, 3) and torch.all(gaussians.sh[:, 1:] == 0)
     assert len(initial_gaussians(grid, colors, 0, 20, seeding.generator(0))) == 20
     with pytest.raises(ValueError, match="at least 4; the scene has 3"):

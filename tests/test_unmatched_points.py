@@ -50,6 +50,15 @@ def test_no_point_stands_before_what_another_view_sees():
     )
 
 
+def test_no_point_stands_before_a_camera_that_looks_elsewhere():
+    """Where the first view shows no point stands a camera that looks to the right, at another wall."""
+    aside = make_camera("aside", SIZE, FOCAL, (0.8, 0.0, DEPTH), yaw(np.pi / 2))
+    x, y, z = wall(2.0, (0, SIZE[0])).T
+    points = np.concatenate([wall(DEPTH, (0, 80)), np.stack([z, y, -x], 1) + aside.center])
+    added, _ = points_for_empty_cells([HERE, aside], {"here": picture(), "aside": picture()}, points)
+    assert len(added) and np.linalg.norm(added - aside.center, axis=1).min() >= 0.5 * 2.0
+
+
 def test_views_that_show_points_everywhere_or_nowhere_get_none():
     for points in (wall(DEPTH, (0, SIZE[0])), np.array([[0.0, 0.0, -1.0]])):
         added, colors = points_for_empty_cells([HERE], {"here": picture()}, points)

@@ -22,6 +22,7 @@ from reffusion.types import Camera, Gaussians, Scene
 
 # One Gaussian a pixel gains .7 dB with 60 views and loses .8 dB with 18 or 21: docs/results.md.
 FEW_VIEWS, MANY_VIEWS, FEW_SHARE = 18, 30, 0.4
+UNMATCHED_OPACITY = 0.05  # initial opacity of a Gaussian at a point that no match confirms
 
 
 def limit_sh_degree(params: Params, scene: Scene) -> Params:
@@ -119,9 +120,10 @@ def collect_points(
     """Collect the points from which a fit starts: the sparse points, and points where pictures show more.
 
     If `params.init.flow_cell` is not 0, all points that optical flow triangulates are added, and then further points
-    where a view shows none of them (`points_for_empty_cells`); the numbers are printed. A point is left out if it
-    projects into `hidden` in more than half of those views that have such a mask and contain the point, because no
-    supervising pixel would ever move Gaussians there.
+    where a view shows none of them (`points_for_empty_cells`); the numbers are printed. No match confirms the further
+    points, so they start almost transparent (`UNMATCHED_OPACITY`): views that see past them remove them sooner. A point
+    is left out if it projects into `hidden` in more than half of those views that have such a mask and contain the
+    point, because no supervising pixel would ever move Gaussians there.
 
     Args:
         cameras: the views between which flow is computed.
@@ -129,9 +131,10 @@ def collect_points(
         hidden: view name -> bool [H, W], True for pixels that do not supervise.
 
     Returns:
-        Positions [P, 3] float64 and colors [P, 3] uint8: sparse points, then those by flow, then the further points.
+        Positions [P, 3] float64, colors [P, 3] uint8 and opacities [P]: sparse points, then those by flow, then the
+        further points.
     """
-    points, colors = scene.points, scene.point_colors
+    points, colors, more = scene.points, scene.point_colors, np.empty((0, 3))
     if params.init.flow_cell:
         flow_points, flow_colors = flow.triangulate_points(cameras, images, params.init.flow_cell)
         print(f"{len(flow_points)} points by optical flow beside {len(points)}", flush=True)
@@ -139,11 +142,15 @@ def collect_points(
         more, more_colors = points_for_empty_cells(cameras, images, points)
         print(f"{len(more)} points where a view shows none of them", flush=True)
         points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+    opacities = np.full(len(points), params.init.opacity)
+    opacities[len(points) - len(more) :] = UNMATCHED_OPACITY
     kept = ~voting.points_inside(points, cameras, hidden)
-    return points[kept], colors[kept]
+    return points[kept], colors[kept], opacities[kept]
 
 
-def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Gaussians:
+def make_gaussians(
+    params: Params, points: np.ndarray, colors: np.ndarray, opacities: np.ndarray | None = None
+) -> Gaussians:
     """Return an initial Gaussian at each point (see `initial_gaussians`), on the device `params.device`.
 
     If there are more points than `params.densify.cap_max`, a random subset of this size is used.
@@ -151,10 +158,12 @@ def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Ga
     Args:
         points: [P, 3] positions, P >= 4; fewer raise ValueError.
         colors: [P, 3] uint8.
+        opacities: [P], the opacity of the Gaussian at each point; None: `params.init.opacity` for all.
     """
     generator, settings = seeding.generator(params.seed, "start"), params.init
     sh_degree, max_gaussians = params.sh.degree, params.densify.cap_max
-    gaussians = initial_gaussians(points, colors, sh_degree, max_gaussians, generator, settings.opacity, settings.scale)
+    opacity = settings.opacity if opacities is None else opacities
+    gaussians = initial_gaussians(points, colors, sh_degree, max_gaussians, generator, opacity, settings.scale)
     return replace(gaussians.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
 
 

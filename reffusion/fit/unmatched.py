@@ -21,6 +21,9 @@ REACH = 3  # cells: one that is nearer than this to a cell with a point needs no
 SMOOTHING = 5  # cells: side of the window in which the depth of cells with points is a median
 FARTHER = 1.5  # factor by which a point moves away while another view sees past it
 MAX_WITNESSES = 24  # number of views that are asked, so that time grows linearly with the views
+# No point is placed nearer to a camera than this share of the depth that all but `NEAREST` percent of its view's cells
+# exceed, in any direction. Where no view looks, points would stand as fog before the cameras of new views (LOG.md).
+FREE_SHARE, NEAREST = 0.5, 5
 
 
 def points_for_empty_cells(
@@ -29,8 +32,8 @@ def points_for_empty_cells(
     """Return new points for the cells of each view that show no point and are `REACH` or more cells from one that does.
 
     A new point has the smoothed depth of the nearest cell that shows a point, times powers of `FARTHER` until none of
-    `MAX_WITNESSES` views sees past it; the depth is limited to `FARTHEST`. New points count as shown in later views. A
-    view that shows no point at all gets none.
+    `MAX_WITNESSES` views sees past it and none of their cameras is near (`FREE_SHARE`); the depth is limited to
+    `FARTHEST`. New points count as shown in later views. A view that shows no point at all gets none.
 
     Args:
         cameras: the views, in the normalized frame.
@@ -55,7 +58,7 @@ def points_for_empty_cells(
         inside = (pixels < (camera.width, camera.height)).all(1)
         pixels, depths = pixels[inside], smooth[tuple(nearest[:, rows[inside], columns[inside]])]
         left = np.arange(len(depths))
-        while len(left := left[_is_seen_past(unproject(camera, pixels[left], depths[left]), witnesses, seen)]):
+        while len(left := left[_is_in_free_space(unproject(camera, pixels[left], depths[left]), witnesses, seen)]):
             depths[left] *= FARTHER
             left = left[depths[left] < FARTHEST]
         added = np.concatenate([added, unproject(camera, pixels, np.minimum(depths, FARTHEST))])
@@ -64,12 +67,14 @@ def points_for_empty_cells(
     return added, np.concatenate(colors)
 
 
-def _is_seen_past(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return bool [P], True for points clearly in front of what a camera shows in their cell (its depth in `seen`)."""
-    past = np.zeros(len(points), bool)
+def _is_in_free_space(points: np.ndarray, cameras: Sequence[Camera], seen: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return bool [P], True for points that a camera sees past (by the depths in `seen`), or that are near a camera."""
+    free = np.zeros(len(points), bool)
     for camera in cameras:
         cells, depth = locate_cells(camera, points, CELL)
         inside = np.flatnonzero(cells >= 0)
         behind = seen[camera.name].reshape(-1)[cells[inside]]
-        past[inside] |= np.isfinite(behind) & (depth[inside] < behind * (1 - SAME_IF_COARSE))
-    return past
+        free[inside] |= np.isfinite(behind) & (depth[inside] < behind * (1 - SAME_IF_COARSE))
+        if len(known := seen[camera.name][np.isfinite(seen[camera.name])]):
+            free |= np.linalg.norm(points - camera.center, axis=1) < FREE_SHARE * np.percentile(known, NEAREST)
+    return free
