@@ -45,6 +45,15 @@ def test_one_picture_for_all_views_and_one_of_a_view(tmp_path):
     )
 
 
+def test_an_empty_folder_ignores_nothing(tmp_path):
+    write_capture(tmp_path, "colmap", make_truth(PINHOLE))
+    facts = poses_plan.scene_facts(poses_plan.Params(), tmp_path)
+    (tmp_path / "ignore").mkdir()
+    assert poses_plan.scene_facts(poses_plan.Params(), tmp_path) == facts
+    (tmp_path / "ignore/notes.txt").write_text("")
+    assert "ignore holds 1 .txt, not read as masks" in refusal_message(tmp_path)
+
+
 def test_ignored_pixels_are_undistorted_like_the_photographs(tmp_path):
     write_capture_to_ignore(tmp_path / "c", ("SIMPLE_RADIAL", (90.0, 48.0, 36.0, -0.2)))
     for name in ("v01", "v02"):

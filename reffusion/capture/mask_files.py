@@ -145,13 +145,13 @@ def find_ignore_masks(folder: Path, capture: Capture, name: str | None) -> dict[
         name: the key `ignore` of scene.yaml: the folder of the masks; "none" for none; None for the usual folder.
 
     Raises:
-        BadInput: the folder is named or exists, but holds no masks; a mask belongs to no picture; or two masks belong
+        BadInput: the folder is named, or holds files, but no masks; a mask belongs to no picture; or two masks belong
             to one picture.
     """
     if name is not None and name.lower() == NONE:
         return {}
     place, files = _mask_paths(folder / (name or IGNORE), capture)
-    if not files and (name is not None or place.is_dir()):
+    if not files and (name is not None or place.is_dir() and _unread(place)):
         raise BadInput(
             f"{place}: no masks there{_unread(place)}; correct `ignore` in scene.yaml, or say `ignore: none`"
         )
