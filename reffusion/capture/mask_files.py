@@ -151,7 +151,7 @@ def find_ignore_masks(folder: Path, capture: Capture, name: str | None) -> dict[
     if name is not None and name.lower() == NONE:
         return {}
     place, files = _mask_paths(folder / (name or IGNORE), capture)
-    if not files and (name is not None or place.is_dir() and _unread(place)):
+    if not files and (name is not None or _unread(place)):
         raise BadInput(
             f"{place}: no masks there{_unread(place)}; correct `ignore` in scene.yaml, or say `ignore: none`"
         )
