@@ -353,7 +353,7 @@ class Session:
                 f"all of {whole[0]} would be ignored; erase a part, or leave the view out: `exclude: [{whole[0]}]`"
             )
         for name, pixels in changed.items():
-            # An empty picture is written too, because a folder `ignore` without pictures is refused.
+            # An empty picture is written too, because a folder that scene.yaml names must hold pictures.
             replace_image(self.capture.ignore[name], to_uint8(pixels * 1.0))
         if changed:
             self.events, self.history = [event for event in self.events if not event.ignores], []
